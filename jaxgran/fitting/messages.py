@@ -66,6 +66,7 @@ MESSAGES = {
     "chance: {chance} %)",
     "too rough": "the curve scatters more than N equal spheres can: a mixture of sizes, eps that "
     "scatters, fewer grains than told, or noise of the measurement",
+    "as few": " (some {number:.2g} grains would scatter as much)",
     "too smooth": "the curve scatters less than N equal spheres do: grains that walls cool, more "
     "grains than told, or a curve that was smoothed",
     "errors too large": "the residuals are smaller than the errors of T allow by chance: these "
@@ -139,7 +140,7 @@ def with_words(
     grade, verdict = _verdict(result, is_misfit, limitations)
     reasons = [
         _chi2(result),
-        *_misfit(rough, smooth, is_misfit),
+        *_misfit(result, rough, smooth, is_misfit),
         *_scatter(result),
         *_of_each(result),
         *_alternatives(result, absent, quick),
@@ -266,9 +267,13 @@ def _chi2(result: Fit) -> str:
     return say("chi2", reduced=result.reduced_chi2, degrees=degrees, chance=chance)
 
 
-def _misfit(rough: bool, smooth: bool, is_misfit: bool) -> Iterator[str]:
+def _misfit(result: Fit, rough: bool, smooth: bool, is_misfit: bool) -> Iterator[str]:
+    known = [m.num_particles for m in result.measurements.values() if m.num_particles is not None]
     if rough:
-        yield say("too rough")
+        as_few = ""
+        if len(known) == len(result.measurements) == 1:
+            as_few = MESSAGES["as few"].format(number=known[0] / result.reduced_chi2)
+        yield MESSAGES["too rough"] + as_few
     if smooth:
         yield say("too smooth" if is_misfit else "errors too large")
 
