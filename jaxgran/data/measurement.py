@@ -76,8 +76,8 @@ class Measurement(eqx.Module):
             logarithm of a positive parameter).
         absent: effects that are known to be absent, of "walls", "roughness", "drag" and "friction":
             a fit does not consider them as explanations of the curve.
-        tracked: number of grains that T is the mean of, if it is less than N: T then has a sampling
-            error in addition. None if T is that of all grains.
+        tracked: number of grains of each run that T is the mean of, if it is less than N: T then
+            has a sampling error in addition. None if T is that of all grains.
         ensemble_start: True if T_0 of the gas is that of an ensemble from which the velocities were
             drawn; False if it is that of the run itself.
         calibration_error: relative standard error of the scale of T, common to all times.

@@ -35,7 +35,7 @@ ALLOWED_OVER_ALL = 3.84
 EXCLUDED = 4 * ALLOWED
 """Increase beyond which larger amplitudes are not tried."""
 
-SIGNIFICANCE = 0.01
+PREFERENCE_LEVEL = 0.01
 """Probability by chance of any alternative being preferred."""
 
 DISTINGUISHABLE_SHARE = 0.1
@@ -43,7 +43,7 @@ DISTINGUISHABLE_SHARE = 0.1
 
 SHARES = (0.05, 0.15, 0.35, 0.6, 0.85, 0.97)
 """Amplitudes of walls, as shares of the initial cooling rate, and of a noise floor, as shares of
-the last temperature."""
+the lowest computed temperature."""
 
 DRAG_SHARES = (0.001, 0.005, 0.02, 0.06, 0.2, 0.5, 0.9)
 """Amplitudes of drag, as shares of the initial cooling rate; its share grows as the gas cools."""
@@ -119,11 +119,12 @@ class Kind(NamedTuple):
 
     Attributes:
         name: in words.
-        parameters: the parameters that it adds, first its amplitude.
+        parameters: the parameters that it adds; the first one identifies the effect.
         amplitudes: values that are tried, in one or two increasing sequences from 0.
         values: values of parameters at an amplitude, given the label of the measurement.
         rate_error: relative error of kinetic theory's cooling rate by it, at an amplitude.
         one_minimum: False if amplitudes beyond excluded ones may be allowed.
+        changes_law: whether it is in the law of the spheres, which drop tests have, too.
         keeps_A: False if A has no meaning in it: it is no part of the range.
     """
 
@@ -133,6 +134,7 @@ class Kind(NamedTuple):
     values: Callable[[float, str], dict[str, float]]
     rate_error: Callable[[float], float] = lambda amplitude: 0.0
     one_minimum: bool = True
+    changes_law: bool = False
     keeps_A: bool = True
 
 
@@ -159,18 +161,18 @@ class Alternative(NamedTuple):
         name: description of the added element or error.
         effect: its name in ``absent`` of `jaxgran.Measurement`; "" for an error of the measurement.
         amplitude: the best amplitude: the share of the initial cooling rate (walls, drag) or of
-            the last T (floor), 1 + beta_t, the relative error, or the delay of the clock over the
-            cooling time.
+            the lowest computed T (floor), 1 + beta_t, 1/mu or mu (sliding), the relative error,
+            the standard deviation of eps, or the delay of the clock over the cooling time.
         allowed: the smallest and the largest amplitude that the data allow.
         improvement: decrease of -2 ln L from the fitted law to the best amplitude.
         estimate: estimate of the free parameters at the best amplitude, SI.
         low, high: range of each free parameter over the allowed amplitudes, SI, 95 %.
         preferred: True if the data prefer this alternative to the fitted law; by chance they
             prefer any of the alternatives in 1 % of fits.
-        distinguishable: True if the data distinguish the alternative from the fitted law: it
-            changes the first parameter by less than 10 % beyond the error of the fitted law.
-        error_reduction_needed: factor by which the errors must decrease to distinguish it; 1 if it
-            is distinguishable.
+        distinguishable: True if the data allow so little of the alternative that it widens the
+            range of the first parameter by less than 10 %.
+        error_reduction_needed: factor by which the errors must decrease for that; 1 if it is
+            distinguishable.
         restitution: eps of an alternative in which it is constant, so that A has no meaning; None
             for all others. It is no part of the range.
 
@@ -263,7 +265,7 @@ def compare_alternatives(
         if kind.keeps_A
     ]
     best = min([*bases, *trials], key=lambda trial: trial.value)
-    significant = float(scipy.stats.chi2.isf(SIGNIFICANCE / max(len(kinds), 1), 1))
+    significant = float(scipy.stats.chi2.isf(PREFERENCE_LEVEL / max(len(kinds), 1), 1))
     summary = _Summary(problem, bases[0], best, significant, noise)
     law = summary.of(None, [[base] for base in bases])
     alternatives = [summary.of(kind, found, law) for kind, found in profiles.items()]
@@ -357,7 +359,9 @@ def _minima(problem: Problem, minima: list[Minimum]) -> list[Trial]:
 
 def _kinds(problem: Problem, flat: np.ndarray, absent: tuple[str, ...]) -> list[Kind]:
     """Return the kinds of alternatives to a fit."""
-    scenes = [m.scene for m in problem.curves]
+    if not problem.curves:
+        return []
+    scenes = {m.label: m.scene for m in problem.curves}
     values = problem.values(flat)
     curves = problem.evaluate(flat).curves
     rates = {m.label: _initial_rate(m, values[m.label], curves[m.label]) for m in problem.curves}
@@ -367,7 +371,7 @@ def _kinds(problem: Problem, flat: np.ndarray, absent: tuple[str, ...]) -> list[
     }
 
     def walls(share: float, label: str) -> dict[str, float]:
-        gas = next(m.scene for m in problem.curves if m.label == label)
+        gas = scenes[label]
         flux = 2 * np.sqrt(float(gas.temperature) / (2 * np.pi))
         side = 2 * (1 - WALL_RESTITUTION**2) * flux / max(share * rates[label], 1e-300)
         side = side + float(gas.diameter)
@@ -409,24 +413,26 @@ def _kinds(problem: Problem, flat: np.ndarray, absent: tuple[str, ...]) -> list[
             one_minimum=False,
         ),
     ]
-    if all(beta_t in gas.domains for gas in scenes):
+    if all(beta_t in gas.domains for gas in scenes.values()):
         sliding = Kind(
             "grains that slide", ("friction",), (SLIDING,), lambda x, label: {"friction": 1 / x}
         )
         possible.append(sliding)
     known = {u.name for u in problem.unknowns}
-    if all("exponent" in m.gas.domains for m in problem.curves) and scenes:
+    if all("exponent" in m.gas.domains for m in problem.curves):
         spread = Kind(
             "eps that scatters from impact to impact",
             ("spread",),
             (SPREADS,),
             lambda x, label: {"spread": x},
+            changes_law=True,
         )
         constant = Kind(
             "a constant coefficient of restitution",
             ("exponent",),
             ((1.0,),),
             lambda x, label: {"exponent": VISCOELASTIC_EXPONENT * (1 - x)},
+            changes_law=True,
             keeps_A=False,
         )
         possible.append(spread)
@@ -443,8 +449,8 @@ def _kinds(problem: Problem, flat: np.ndarray, absent: tuple[str, ...]) -> list[
     if all(np.any(m.errors[:, 0] > 0) for m in problem.curves):
         known.add(WHITE)
     known |= {DECLARABLE[name][0] for name in absent}
-    known |= {name for gas in scenes for name in gas.domains}
-    return [kind for kind in possible if known.isdisjoint(kind.parameters) and scenes]
+    known |= {name for gas in scenes.values() for name in gas.domains}
+    return [kind for kind in possible if known.isdisjoint(kind.parameters)]
 
 
 def _initial_rate(m: CurveRows, values: dict[str, Any], curve: dict[str, Any]) -> float:
@@ -483,12 +489,11 @@ def _trial(problem: Problem, amplitude: float, first: np.ndarray) -> Trial | Non
 
 def _profile(problem: Problem, kind: Kind, base: Trial) -> list[Trial]:
     """Return fits with increasing amplitudes, from 0, of an alternative."""
-    is_of_law = kind.parameters[0] in ("spread", "exponent")  # which drop tests have, too
 
     def fit_with(amplitude: float, first: np.ndarray) -> Trial | None:
         fixed = {
             m.label: kind.values(amplitude, m.label)
-            if is_of_law or isinstance(m, CurveRows)
+            if kind.changes_law or isinstance(m, CurveRows)
             else {}
             for m in problem.measurements
         }
@@ -523,7 +528,7 @@ def _profile(problem: Problem, kind: Kind, base: Trial) -> list[Trial]:
             trials.append(trial)
             lowest = min(lowest, trial.value)
             if trial.value > lowest + ALLOWED_OVER_ALL:
-                trials += _at_the_limit(fit_with, before, trial, lowest, ALLOWED_OVER_ALL)
+                trials += _at_the_limit(fit_with, before, trial, lowest)
             previous = before
             before = trial
             excluded = EXCLUDED * (1.0 if kind.one_minimum else BARRIER)
@@ -542,13 +547,14 @@ def _at_the_vertex(
     fit_with: Callable[[float, np.ndarray], Trial | None], three: list[Trial]
 ) -> Trial | None:
     """Return the fit at the vertex of the parabola through a minimum of -2 ln L, or on its side."""
-    x, value = (np.array([getattr(t, name) for t in three]) for name in ("amplitude", "value"))
+    x = np.array([trial.amplitude for trial in three])
+    value = np.array([trial.value for trial in three])
     curvature, slope, _ = np.polyfit(x - x[1], value, 2)
     drop = max(np.min(np.delete(value, 1)) - value[1], slope**2 / (4 * curvature))
     if drop < MIN_DROP * ALLOWED:
         return None
     vertex = x[1] - slope / (2 * curvature)
-    if not np.min(np.abs(vertex - x)) > MIN_SPACING * (x[2] - x[0]):
+    if np.min(np.abs(vertex - x)) <= MIN_SPACING * (x[2] - x[0]):
         vertex = (x[1] + (x[2] if vertex > x[1] else x[0])) / 2
     return fit_with(vertex, three[1].flat)
 
@@ -558,15 +564,17 @@ def _at_the_limit(
     low: Trial,
     high: Trial,
     least: float,
-    increase: float,
 ) -> list[Trial]:
-    """Return fits near the amplitude at which -2 ln L, a parabola, exceeds its least value by this.
+    """Return fits near the amplitude at which -2 ln L, a parabola, exceeds its least value by
+    `ALLOWED_OVER_ALL`.
 
-    The last one comes within a quarter of the increase, if `NUM_REFINED` are enough.
+    The last one comes within a quarter of this increase, if `NUM_REFINED` are enough.
     """
+    increase = ALLOWED_OVER_ALL
     trials = []
     while low.value <= least + increase < high.value and len(trials) < NUM_REFINED:
-        at_low, at_high = np.sqrt(low.value - least), np.sqrt(high.value - least)
+        at_low = np.sqrt(low.value - least)
+        at_high = np.sqrt(high.value - least)
         share = float(np.clip((np.sqrt(increase) - at_low) / (at_high - at_low), 0.05, 0.95))
         amplitude = low.amplitude + share * (high.amplitude - low.amplitude)
         trial = fit_with(amplitude, low.flat + share * (high.flat - low.flat))

@@ -12,7 +12,7 @@ from jaxgran._utils.validation import check_bool, checked_int
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import START_TIME, Measurement, Priors
-from jaxgran.fitting.estimate import Request, fit_without_noise
+from jaxgran.fitting.estimate import fit_without_noise
 from jaxgran.fitting.learnt_law import describe_unvisited_knots
 from jaxgran.fitting.messages import describe_search
 from jaxgran.fitting.parameters import (
@@ -25,6 +25,7 @@ from jaxgran.fitting.parameters import (
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.rows import unused_rotation
 from jaxgran.fitting.search import Descent, is_transformation
+from jaxgran.fitting.setup import Request
 from jaxgran.fitting.simulations import MAX_LINEARISED, fit_through_simulations
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_gas, checked_key, checked_model

@@ -30,8 +30,8 @@ RELATIVE_SPEEDS = np.linspace(0.005, 4.0, 800)
 """Impact speeds over 2 sqrt(T)."""
 
 MIN_VARIANCE = 1e-4
-"""Share of the largest variance below which a combination of these values is ignored: it is known
-only through the smoothness prior."""
+"""Relative eigenvalue of the covariance of ln eps below which a combination of its values is
+ignored: it is known only through the smoothness prior."""
 
 
 class RestitutionBand(NamedTuple):
@@ -69,10 +69,19 @@ class RestitutionBand(NamedTuple):
         Returns:
             chi^2 of L per degree of freedom, its p-value, and the fitted gas. Values of
             1 or less mean that the band contains a law of this form.
+
+        Raises:
+            ValueError: for a band with one independent value.
         """
         variances, axes = np.linalg.eigh(self.covariance)
         known = variances > MIN_VARIANCE * variances[-1]
         whiten = axes[:, known].T / np.sqrt(variances[known])[:, None]
+        degrees = int(known.sum()) - 1
+        if degrees < 1:
+            raise ValueError(
+                "one independent value of the band cannot test a formula with one free number: "
+                "give more speeds, or free more numbers of the law"
+            )
         measured = -np.log(self.restitution)
         domain = gas.domains[free]
 
@@ -82,7 +91,7 @@ class RestitutionBand(NamedTuple):
 
         first = np.ravel(domain.to_free(np.asarray(gas.value(free))))
         solution = scipy.optimize.least_squares(residuals, first)
-        degrees, chi2 = int(known.sum()) - 1, 2 * float(solution.cost)
+        chi2 = 2 * float(solution.cost)
         fitted = gas.replace(**{free: domain.from_free(solution.x[0])})
         return chi2 / degrees, float(scipy.stats.chi2.sf(chi2, degrees)), fitted
 
@@ -101,9 +110,9 @@ def visited_speeds(result: Fit) -> tuple[float, float]:
     T = T[T > 0]
     gas = first_gas(result)
 
-    def quantile(share: float, T: float) -> float:
+    def quantile(share: float, temperature: float) -> float:
         relative = RELATIVE_SPEEDS
-        speeds = 2 * np.sqrt(T) * relative
+        speeds = 2 * np.sqrt(temperature) * relative
         lost = 1 - np.asarray(gas.restitution(jnp.asarray(speeds))) ** 2
         weights = np.maximum(lost, np.finfo(float).tiny) * relative**3 * np.exp(-(relative**2))
         sums = np.cumsum(weights)
@@ -159,13 +168,14 @@ def restitution_band(result: Fit, speeds: Any = None) -> RestitutionBand:
     POSITIVE.check("speeds", speeds, "Give normal impact speeds in m/s.")
     v = np.asarray(speeds, float)
     law = jax.tree_util.Partial(_losses, speeds=jnp.asarray(np.append(v, grid)))
-    floats = {name: gas.value(name) for name in own}
+    floats = {name: jnp.asarray(gas.value(name)) for name in own}
     losses, slopes = residuals_and_slopes(law, gas, floats)
     parts = [np.asarray(slopes[name]) for name in own]
-    at = [i for name in own for i, of in enumerate(result.names_of_elements) if of == name]
+    elements = list(enumerate(result.names_of_elements))
+    indices = [i for name in own for i, element in elements if element == name]
     slope = np.concatenate(parts, axis=1)
-    covariance = result.covariance[np.ix_(at, at)]
-    covariance = slope @ covariance @ slope.T
+    of_parameters = result.covariance[np.ix_(indices, indices)]
+    covariance = slope @ of_parameters @ slope.T
     error = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
     # Quantile of the largest of the standardised errors at the speeds of the grid.
     correlation = (covariance / np.outer(error, error))[v.size :, v.size :]
@@ -174,9 +184,9 @@ def restitution_band(result: Fit, speeds: Any = None) -> RestitutionBand:
     )
     factor = np.quantile(np.abs(draws).max(axis=1), 0.95)
     losses = np.asarray(losses)[: v.size]
-    wide = factor * error[: v.size]
-    low = np.exp(-(losses + wide))
-    high = np.exp(-np.maximum(losses - wide, 0.0))
+    half_width = factor * error[: v.size]
+    low = np.exp(-(losses + half_width))
+    high = np.exp(-np.maximum(losses - half_width, 0.0))
     own_covariance = covariance[: v.size, : v.size]
     return RestitutionBand(v, np.exp(-losses), low, high, visited, own_covariance)
 

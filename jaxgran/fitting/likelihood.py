@@ -55,9 +55,15 @@ Measured: 60 of 250 spheres, eps = .9, 400 replicas: correlations .75, .56, .42,
 LOG_FROM, LINEAR_TO = 10.0, 5.0
 """T over its error above which ln T is compared, and below which T itself is."""
 
-SCATTER_STEPS = {True: np.linspace(-3.0, 3.0, 7), False: np.linspace(-2.5, 2.5, 25)}
+STEPS_OF_KNOWN_N = np.linspace(-3.0, 3.0, 7)
 """Values of the logarithm of N over which a likelihood is integrated, in standard errors of its
-prior, where N is known and where it is not."""
+prior."""
+
+STEPS_OF_UNKNOWN_N = np.linspace(-2.5, 2.5, 25)
+"""The same where N is not known."""
+
+LAW_CONSTANTS = ("dissipative_constant", "coefficient", "drops")
+"""Parameters of laws that `guess_from_data` knows."""
 
 SMALLEST_VARIANCE = 1e-12
 """Variance of a value that is given without an error and has none by theory, relative."""
@@ -178,20 +184,22 @@ def _run_filter(
     first = first.at[sample, sample].set(noise.sample)
     mean = jnp.zeros((size, *residuals.shape[2:]), dtype)
     variances = variances + SMALLEST_VARIANCE
+    unit = jnp.eye(size, dtype=dtype)[..., None]
 
-    def update(state, covariance_with, own, expected, value, variance, is_used):
+    def update(state, weights, value, variance, is_used):
         """Return the state after a value, its innovation and its variance.
 
-        `covariance_with` are the covariances of the variables with the value, and `own` its
-        variance, both without its own error.
+        The value is the sum of the variables with these weights, shape (n, gases), and an
+        independent error of the given variance.
         """
         mean, covariance = state
-        spread = own + variance
-        innovation = is_used * (value - expected)
-        gain = is_used * covariance_with / spread
+        with_value = jnp.sum(covariance * weights, axis=1)
+        whole = jnp.sum(weights * with_value, axis=0) + variance
+        innovation = is_used * (value - jnp.sum(weights[:, None] * mean, axis=0))
+        gain = is_used * with_value / whole
         mean = mean + gain[:, None] * innovation[None]
-        covariance = covariance - spread * gain[:, None] * gain[None]
-        return (mean, covariance), innovation, spread
+        covariance = covariance - whole * gain[:, None] * gain[None]
+        return (mean, covariance), innovation, whole
 
     def step(state, at):
         mean, covariance = state
@@ -199,22 +207,16 @@ def _run_filter(
         mean = mean + jnp.sum(change[:, :, None] * mean[None], axis=1)
         moved = covariance + product(change, covariance)
         covariance = moved + product(moved, transposed(change)) + increment
-        # T is that of the gas, with the sampling error.
-        along = share * covariance[:, 0] + covariance[:, sample]
-        own = share * along[0] + along[sample]
-        expected = share * mean[0] + mean[sample]
-        (mean, covariance), one, spread = update(
-            (mean, covariance), along, own, expected, value[0], variance[0], is_used[0]
+        # T is that of the gas, with the sampling error; ln T_rot is ln T + ln(T_rot/T).
+        of_T = share * unit[0] + unit[sample]
+        of_rotation = unit[0] + by_rotation * unit[1]
+        state = mean, covariance
+        state, of_first, variance_of_first = update(state, of_T, value[0], variance[0], is_used[0])
+        state, of_second, variance_of_second = update(
+            state, of_rotation, value[1], variance[1], is_used[1]
         )
-        # ln T_rot is ln T and the logarithm of the ratio.
-        ratio = min(1, size - 3)
-        along = covariance[:, 0] + by_rotation * covariance[:, ratio]
-        own = along[0] + by_rotation * along[ratio]
-        expected = mean[0] + by_rotation * mean[ratio]
-        state, other, further = update(
-            (mean, covariance), along, own, expected, value[1], variance[1], is_used[1]
-        )
-        return state, (jnp.stack([one, other]), jnp.stack([spread, further]))
+        found = jnp.stack([of_first, of_second])
+        return state, (found, jnp.stack([variance_of_first, variance_of_second]))
 
     at = changes, increments, sensitivity, of_rotation, residuals, variances, used
     return jax.lax.scan(step, (mean, first), at)[1]
@@ -329,7 +331,7 @@ def log_likelihood(
     with jax.ensure_compile_time_eval():  # the measurement is known, where the gas is traced
         rows, _ = curve_rows("", measurement, model, fits_T_0=False, fits_t0=False)
         times, place = times_with_nodes(np.asarray(rows.curve.times) * rows.faster, rows.unit_time)
-        guess = guess_from_data(measurement.gas, rows.curve, ANY_CONSTANT)
+        guess = guess_from_data(measurement.gas, rows.curve, LAW_CONSTANTS)
         rows = with_rate_error(rows, model, guess)
     computed = model.simulate(gas, jnp.asarray(times), DEFAULTS)
     nothing = jnp.zeros_like(computed.temperature)
@@ -340,13 +342,6 @@ def log_likelihood(
     steps = jnp.diff(times) * (speed[1:] + speed[:-1]) / 2 * gas.collision_frequency
     collisions = jnp.append(0.0, jnp.cumsum(steps))
     collisions = collisions if computed.collisions is None else computed.collisions
-    nodes = Nodes(
-        jnp.asarray(times),
-        log_T[:, None],
-        ratio[:, None],
-        nothing if computed.sonine is None else computed.sonine,
-        collisions[:, None],
-    )
     observed = jax.tree.map(jnp.asarray, rows.at_nodes(times.size, place))
     logs = jnp.stack([log_T, log_T + jnp.log(jnp.where(ratio > 0, ratio, 1.0))], axis=1)
     residuals = log_ratio(observed.values, logs, observed.errors)
@@ -357,22 +352,23 @@ def log_likelihood(
         if name in rows.nuisances:
             columns.append(jnp.broadcast_to(jnp.asarray(shape), residuals.shape))
             widths.append(rows.nuisances[name])
-    log_scatters = SCATTER_STEPS[measurement.num_particles is not None]
+    is_known = measurement.num_particles is not None
+    log_scatters = STEPS_OF_KNOWN_N if is_known else STEPS_OF_UNKNOWN_N
     count = log_scatters.size
 
     def for_each(x: Array) -> Array:
         return jnp.broadcast_to(x[..., None], (*x.shape, count))
 
-    each = Nodes(
-        nodes.times,
-        jnp.repeat(nodes.log_temperature, count, axis=1),
-        jnp.repeat(nodes.rotation, count, axis=1),
-        nodes.sonine,
-        jnp.repeat(nodes.collisions, count, axis=1),
+    nodes = Nodes(
+        jnp.asarray(times),
+        for_each(log_T),
+        for_each(ratio),
+        nothing if computed.sonine is None else computed.sonine,
+        for_each(collisions),
     )
     values, spread = filtered(
         jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *jnp.shape(x))), gas),
-        each,
+        nodes,
         for_each(jnp.stack(columns, axis=-1)),
         for_each(variances),
         for_each(jnp.ones_like(log_T)),
@@ -399,13 +395,11 @@ def log_likelihood(
     return jnp.where(jnp.isnan(value), -jnp.inf, value)
 
 
-ANY_CONSTANT = ("dissipative_constant", "coefficient", "drops")
-"""Parameters of laws that `guess_from_data` knows."""
-
-
 def _without_factors(values: Array, weights: Array, widths: Array) -> Array:
-    """Return the sum of weighted squares of the first column, with factors of the others
-    integrated out, which are known to be 0 within their widths."""
+    """Return ``r^T W r`` of the first column r, with its common factors integrated out.
+
+    The factors have the shapes of the other columns, and are Gaussian about 0 with these widths.
+    """
     flat = values.reshape(-1, values.shape[-1])
     weights = weights.reshape(-1)
     square = jnp.sum(weights * flat[:, 0] ** 2)

@@ -139,9 +139,7 @@ class Fit:
     @property
     def error_budget(self) -> dict[str, Float[np.ndarray, "p"]]:
         """The parts of `standard_error`, SI; their squares add up to its square."""
-        return {
-            name: np.sqrt(np.maximum(np.diag(part), 0.0)) for name, part in self.covariances.items()
-        }
+        return {name: np.sqrt(np.diag(part)) for name, part in self.covariances.items()}
 
     @property
     def reduced_chi2(self) -> float:

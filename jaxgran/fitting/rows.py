@@ -21,6 +21,7 @@ from jaxgran.models.linearise import (
     with_neutral_elements,
     with_variant_law,
 )
+from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.gas import Gas
 
 SCATTER = "scatter of N"
@@ -274,7 +275,7 @@ def curve_rows(
     uses_rotation = gas.surface is not None and curve.rotational_temperature is not None
     T_rot = np.asarray(curve.rotational_temperature) if uses_rotation else np.ones_like(T)
     given = [curve.temperature_error, curve.rotational_temperature_error if uses_rotation else None]
-    components = [gas.dimension, 2 * gas.dimension - 3]
+    components = [gas.dimension, NUM_SPIN_COMPONENTS[gas.dimension]]
     errors = np.stack(
         [
             _errors_of_measurement(name, measurement, x, values, degrees, notes)
@@ -297,7 +298,8 @@ def curve_rows(
     tracked = measurement.tracked
     sample = 0.0
     if tracked is not None:
-        sample = 2 / (gas.dimension * tracked) * (1 - (0 if N is None else tracked / N))
+        left = 1 - (0 if N is None else tracked / N)
+        sample = 2 / (gas.dimension * tracked * measurement.replicas) * left
     rows = CurveRows(
         label,
         measurement,
@@ -311,7 +313,7 @@ def curve_rows(
         unit_time=float(gas.mean_free_time),
         rate_error=(np.zeros(1), np.zeros(1)),
         rotation_accuracy=float(model.rotation_accuracy(gas)) if uses_rotation else 0.0,
-        displacement=None if fits_t0 else _displacement(measurement, model, notes),
+        displacement=None if fits_t0 else _displacement(measurement, model),
         sample=sample,
         first=2 / gas.dimension if measurement.ensemble_start and not fits_T_0 else 0.0,
     )
@@ -320,7 +322,8 @@ def curve_rows(
 
 def _has_error_at_first(measurement: Measurement) -> bool:
     error = measurement.curve.temperature_error
-    return error is not None and measurement.replicas == 1 and float(error[0]) > 0
+    counts = measurement.replicas == 1 or measurement.errors_measured
+    return error is not None and counts and float(error[0]) > 0
 
 
 def _errors_of_measurement(
@@ -338,11 +341,13 @@ def _errors_of_measurement(
     samples of N grains; those of a sample of the grains are computed, too.
     """
     nothing = np.zeros_like(values)
-    if given is None or measurement.replicas > 1:
+    if given is None:
         return nothing
     error = np.asarray(given)
     if measurement.errors_measured:
         return error
+    if measurement.replicas > 1:
+        return nothing
     if measurement.tracked is not None:
         notes.append(f"{name} is not used: the sampling of {measurement.tracked} grains is known")
         return nothing
@@ -351,17 +356,15 @@ def _errors_of_measurement(
         ratio = error[error > 0] / (2 / (components * N)) ** 0.5 / values[error > 0]
         if np.all(np.abs(ratio - 1) < ERRORS_OF_PARTICLES):
             notes.append(
-                f"{name} is that of independent samples of {N} grains and is not used: the energy "
-                "of all grains of one run fluctuates less, as theory knows. If these are errors of "
+                f"{name} equals the fluctuation of independent samples of {N} grains and is not "
+                "used: the energy of all grains of one run fluctuates less. If these are errors of "
                 "the measurement, say so: `errors: measured`"
             )
             return nothing
     return error
 
 
-def _displacement(
-    measurement: Measurement, model: AbstractModel, notes: list[str]
-) -> Displacement | None:
+def _displacement(measurement: Measurement, model: AbstractModel) -> Displacement | None:
     """Return <dr^2> if it was measured with errors, or of N grains, and the model knows it."""
     curve = measurement.curve
     gas = measurement.gas

@@ -69,12 +69,14 @@ class Minimum(NamedTuple):
         value: -2 ln L there.
         steps: number of steps.
         converged: whether the search reached its tolerance.
+        trace: course of a gradient descent; None for other searches.
     """
 
     flat: Float[np.ndarray, "unknowns"]
     value: float
     steps: int
     converged: bool
+    trace: "Trace | None" = None
 
 
 class Trace(NamedTuple):
@@ -89,6 +91,24 @@ class Trace(NamedTuple):
     loss: Float[np.ndarray, "steps"]
     parameters: Float[np.ndarray, "steps p"]
     reason: str
+
+
+class Course(NamedTuple):
+    """What a gradient descent passed.
+
+    Attributes:
+        flats: the unknowns at each step.
+        losses: -2 ln L at each step, inf where it is not a number.
+        converged: whether it ended at a minimum.
+        diverged: whether the loss grew, or ceased to be finite.
+        trace: for the user.
+    """
+
+    flats: Float[np.ndarray, "steps unknowns"]
+    losses: Float[np.ndarray, "steps"]
+    converged: bool
+    diverged: bool
+    trace: Trace
 
 
 def newton_step(found: Evaluation) -> tuple[np.ndarray, float]:
@@ -159,7 +179,7 @@ def minimise(
         },
     )
     end = np.asarray(solution.x)
-    limit = STALLED_STEP if stalled >= MAX_STALLED else tolerance
+    limit = max(tolerance, STALLED_STEP) if stalled >= MAX_STALLED else tolerance
     step, length = newton_step(problem.evaluate(end))
     if length < CONVERGED_STEP:
         end = end + step
@@ -180,8 +200,9 @@ def best_of_starts(
     """
     starts = [first]
     names = np.repeat([u.name for u in problem.unknowns], [u.size for u in problem.unknowns])
-    for domain in [u.domain for u in problem.unknowns if u.name == MULTIMODAL_PARAMETER][:1]:
-        values = domain.to_free(np.asarray(MULTIMODAL_STARTS))
+    domains = {u.name: u.domain for u in problem.unknowns}
+    if MULTIMODAL_PARAMETER in domains:
+        values = domains[MULTIMODAL_PARAMETER].to_free(np.asarray(MULTIMODAL_STARTS))
         starts += [np.where(names == MULTIMODAL_PARAMETER, x, first) for x in values]
     found = [search(problem, start, max_steps) for start in starts]
     best = min(found, key=lambda minimum: minimum.value)
@@ -193,21 +214,19 @@ def is_transformation(solver: Any) -> bool:
     return all(callable(getattr(solver, name, None)) for name in ("init", "update"))
 
 
-@dataclass
+@dataclass(frozen=True)
 class Descent:
-    """A gradient descent, and its course once it has run.
+    """A gradient descent.
 
     Attributes:
         solver: gradient transformation of optax.
         progress: show a progress bar.
         throw: raise RuntimeError for a descent that diverges.
-        trace: its course.
     """
 
     solver: Any
     progress: bool
     throw: bool
-    trace: Trace | None = None
 
     def __call__(self, problem: Problem, first: np.ndarray, max_steps: int) -> Minimum:
         """Minimise -2 ln L of a model without noise: a search as `minimise`."""
@@ -223,11 +242,15 @@ class Descent:
             return found.value, found.gradient, newton_step(found)[1] < DESCENT_STEP
 
         size = sum(row.values.size for row in problem.evaluate(first).rows)
-        flats, losses, converged, _ = self.descend(
-            loss, first, max_steps, size, problem.estimates, noisy=False
+        course = self.descend(loss, first, max_steps, size, problem.estimates, noisy=False)
+        best = int(np.argmin(course.losses))
+        return Minimum(
+            course.flats[best],
+            float(course.losses[best]),
+            len(course.flats),
+            course.converged,
+            course.trace,
         )
-        best = int(np.argmin(losses))
-        return Minimum(flats[best], float(losses[best]), len(flats), converged)
 
     def descend(
         self,
@@ -238,11 +261,10 @@ class Descent:
         estimates: Callable[[np.ndarray], np.ndarray],
         *,
         noisy: bool,
-    ) -> tuple[np.ndarray, np.ndarray, bool, bool]:
-        """Return parameters and losses of all steps, and whether they converged and diverged.
+    ) -> Course:
+        """Descend until the loss ceases to fall.
 
-        Losses of nan are returned as inf. `loss_and_gradient` also returns True at a minimum;
-        `size` is the number of residuals.
+        `loss_and_gradient` also returns True at a minimum; `size` is the number of residuals.
         """
         import optax  # the user has imported it to make the solver
 
@@ -280,7 +302,7 @@ class Descent:
                     break
                 converged = at_minimum or _has_ceased(losses, noisy)
                 if converged:
-                    reason = "the next Newton step is below .01 standard errors"
+                    reason = f"the next Newton step is below {DESCENT_STEP:g} standard errors"
                     if not at_minimum:
                         steps = WINDOW if noisy else PATIENCE
                         reason = f"-2 ln L no longer falls, in {steps} steps"
@@ -293,11 +315,11 @@ class Descent:
                         "search. Use optax.adam(0.05)"
                     ) from error
                 flat = flat + changes
-        self.trace = Trace(np.asarray(losses), np.stack([estimates(x) for x in flats]), reason)
+        trace = Trace(np.asarray(losses), np.stack([estimates(x) for x in flats]), reason)
         if growth and self.throw:
             raise RuntimeError(f"{reason}; throw=False returns the best step so far")
-        finite = np.nan_to_num(losses, nan=np.inf)
-        return np.stack(flats), finite, converged, bool(growth)
+        numbers = np.where(np.isnan(losses), np.inf, losses)
+        return Course(np.stack(flats), numbers, converged, bool(growth), trace)
 
 
 def _has_ceased(losses: list[float], noisy: bool) -> bool:

@@ -23,20 +23,19 @@ from jaxgran.data.curve import CoolingCurve, Run
 from jaxgran.data.measurement import Measurement
 from jaxgran.fitting.alternatives import Explanations, compare_alternatives
 from jaxgran.fitting.estimate import (
+    describe_gas,
+    fit_without_noise,
+    parameter_ranges,
+    titles,
+    with_messages,
+)
+from jaxgran.fitting.goodness import goodness
+from jaxgran.fitting.information import (
     FEW_PARTICLES,
     SOURCE_STEP,
-    Request,
-    described,
-    fit_without_noise,
-    goodness,
     inverse,
-    problem_of,
-    problem_with_rate_errors,
-    ranges_of,
-    titles,
+    positive,
     undetermined,
-    with_all_words,
-    with_values_of,
 )
 from jaxgran.fitting.messages import say
 from jaxgran.fitting.parameters import (
@@ -51,7 +50,13 @@ from jaxgran.fitting.prediction import PredictedCurve, Residuals, predicted_curv
 from jaxgran.fitting.problem import Problem, summed
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.rows import CurveRows, curve_rows, with_rate_error
-from jaxgran.fitting.search import Descent, Minimum
+from jaxgran.fitting.search import Descent, Minimum, Trace
+from jaxgran.fitting.setup import (
+    Request,
+    build_problem,
+    problem_with_rate_errors,
+    with_values_of,
+)
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.choose import error_model_along
 from jaxgran.models.kinetic_theory import KineticTheory
@@ -251,6 +256,7 @@ class Search(NamedTuple):
         curve: of the last simulation.
         number: of simulations.
         converged: whether the last step was below `AVERAGING_DISTANCE`, or the descent ended.
+        trace: course of a gradient descent; None for other searches.
     """
 
     average: Average
@@ -258,6 +264,7 @@ class Search(NamedTuple):
     curve: CoolingCurve
     number: int
     converged: bool
+    trace: Trace | None = None
 
 
 def fit_through_simulations(
@@ -304,7 +311,7 @@ def fit_through_simulations(
         search = _by_gauss_newton(sims, first, max_simulations)
     else:
         search = _by_descent(sims, first, max_simulations, descent)
-    return _result(request, of_theory, sims, search, descent, notes)
+    return _result(request, of_theory, sims, search, notes)
 
 
 def _with_gas(measurement: Measurement, gas: Gas) -> Measurement:
@@ -381,18 +388,20 @@ def _by_descent(
         return *jax.value_and_grad(loss)(jnp.asarray(flat), step), False
 
     size = int(np.sum(sims.rows.used))
-    flats, losses, converged, diverged = descent.descend(
-        at, first, max_simulations, size, sims.problem.estimates, noisy=True
-    )
-    averaged = 1 if diverged else (len(flats) + 1) // 2
-    flat = flats[np.argmin(losses)] if diverged else np.mean(flats[-averaged:], axis=0)
+    course = descent.descend(at, first, max_simulations, size, sims.problem.estimates, noisy=True)
+    flats = course.flats
+    averaged = 1 if course.diverged else (len(flats) + 1) // 2
+    flat = np.mean(flats[-averaged:], axis=0)
+    if course.diverged:
+        flat = flats[np.argmin(course.losses)]
     numbers = range(len(flats), len(flats) + NUM_LINEARISED)
     runs = [sims.run(flat, n) for n in numbers]
     near = [s for s, _ in runs]
     average = sims.average(near)
     noise = average.noise * NUM_LINEARISED / averaged
     average = average._replace(flat=flat, noise=noise)
-    return Search(average, near, runs[-1][1], len(flats) + NUM_LINEARISED, converged)
+    number = len(flats) + NUM_LINEARISED
+    return Search(average, near, runs[-1][1], number, course.converged, course.trace)
 
 
 def _result(
@@ -400,7 +409,6 @@ def _result(
     of_theory: Request,
     sims: Simulations,
     search: Search,
-    descent: Descent | None,
     notes: list[str],
 ) -> Fit:
     """Return the result of a search through simulations."""
@@ -433,7 +441,7 @@ def _result(
     for name in ("measurement", FEW_PARTICLES, "model", "simulation"):
         less = linear(**{name: 1 - SOURCE_STEP})
         more = linear(**{name: 1 + SOURCE_STEP})
-        covariances[name] = to_si @ ((less - more) / (2 * SOURCE_STEP)) @ to_si.T
+        covariances[name] = to_si @ positive((less - more) / (2 * SOURCE_STEP)) @ to_si.T
     covariances["simulation"] = scale * average.noise * scale.T
     if prior_rows.size:
         covariances[SMOOTHNESS] = to_si @ prior_rows.T @ prior_rows @ to_si.T
@@ -485,22 +493,22 @@ def _result(
         curve=search.curve,
         estimate=problem.estimates(flat),
         covariances=covariances,
-        ranges=ranges_of(problem, explanations),
+        ranges=parameter_ranges(problem, explanations),
         alternatives=() if explanations is None else explanations.alternatives,
         **goodness(problem, found),
         log_likelihood=-0.5 * found.value,
         residuals={"": by_field},
         scatter={"": (ratio, (2 / max(number - p, 1)) ** 0.5)},
-        scales={"": described(gas, sims.rows)},
+        scales={"": describe_gas(gas, sims.rows)},
         start_time={"": 0.0},
         weights={"": np.ones(p)},
         undetermined=undetermined(problem, found),
         other_minima=np.zeros((0, p)),
         converged=search.converged,
         iterations=search.number,
-        trace=None if descent is None else descent.trace,
+        trace=search.trace,
     )
-    return with_all_words(request, result, explanations, notes, 0.0)
+    return with_messages(request, result, explanations, notes, 0.0)
 
 
 NOT_COMPARED = (
@@ -530,7 +538,7 @@ def _explanations(
     noise: np.ndarray,
 ) -> Explanations | None:
     """Compare alternatives by kinetic theory, shifted to the curve of the fitted particles."""
-    problem, first, _ = problem_of(of_theory)
+    problem, first, _ = build_problem(of_theory)
     start = first.copy()
     start[: flat.size] = flat
     (rows,) = problem.curves

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.fitting.estimate import Request, problem_of, problem_with_rate_errors
 from jaxgran.fitting.prediction import predicted_curve
 from jaxgran.fitting.rows import curve_rows
 from jaxgran.fitting.search import minimise
+from jaxgran.fitting.setup import Request, build_problem, problem_with_rate_errors
 from tests.beads import glass_beads
 from tests.fitting.curves import A, cooled_beads
 
@@ -67,7 +67,7 @@ def test_the_likelihood_is_that_of_the_fit():
     gas, curve = cooled_beads()
     measurement = jaxgran.Measurement(gas, curve, num_particles=10**6)
     request = Request({"": measurement}, THEORY, (A,), (), {}, None, (), quick=True)
-    problem, first, _ = problem_of(request)
+    problem, first, _ = build_problem(request)
     # The error of theory is that of the first guess of A, here as in `log_likelihood`.
     problem = problem_with_rate_errors(problem, first)
     best = minimise(problem, first, 100)
