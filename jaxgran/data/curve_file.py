@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxgran._utils.validation import check_bool
 from jaxgran.data import files, tracks
-from jaxgran.data.curve import QUANTITIES, CoolingCurve, from_arrays, to_arrays
+from jaxgran.data.curve import QUANTITIES, CoolingCurve, check_values, from_arrays, to_arrays
 from jaxgran.data.drop_test import DROP_TEST_COLUMNS, DropTest
 from jaxgran.data.header import checked_header, gas_or_none, header_choice
 from jaxgran.data.questions import ask_about_columns
@@ -120,8 +120,10 @@ def read_data(path: Path, given: dict[str, str]) -> Content:
         return Content(curve, header, questions)
     columns, rounding = _with_temperature(table, header)
     fields = {quantity.column: quantity.field for quantity in QUANTITIES.values()}
-    curve = from_arrays({fields[name]: jnp.asarray(x) for name, x in columns.items()})
-    curve.check(lambda i: f"line {table.lines[i]}")
+    arrays = {fields[name]: jnp.asarray(x) for name, x in columns.items()}
+    check_values(arrays, place=lambda i: f"line {table.lines[i]}")
+    curve = from_arrays(arrays)
+    curve.check_measured()
     questions = list(ask_about_columns(curve, header, gas_or_none(header), rounding))
     return Content(curve, header, questions, rounding)
 

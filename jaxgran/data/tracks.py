@@ -10,7 +10,7 @@ import numpy as np
 import scipy  # which imports scipy.stats at its first use
 from jaxtyping import Float, Int
 
-from jaxgran.data.curve import MIN_POINTS, CoolingCurve
+from jaxgran.data.curve import MIN_POINTS, CoolingCurve, check_values
 from jaxgran.data.files import header_count, header_number
 from jaxgran.data.particles import Frame, open_frames
 from jaxgran.scene.gas import Gas
@@ -229,13 +229,14 @@ def curve_of_tracks(
             true = T / _displacement_factor(rate * duration * np.sqrt(true))
         words = "impacts between frames take up to {} from T", "use frames closer together"
         note_correction("impacts between frames corrected", np.max(1 - T / true), *words)
-    curve = CoolingCurve(
-        times=jnp.asarray([step.time for step in usable]),
-        temperature=jnp.asarray(true),
-        temperature_error=jnp.asarray(error * true / T),
-    )
+    fields = {
+        "times": jnp.asarray([step.time for step in usable]),
+        "temperature": jnp.asarray(true),
+        "temperature_error": jnp.asarray(error * true / T),
+    }
+    check_values(fields, place="T between frames {} and the next".format)
+    curve = CoolingCurve(**fields)
     header["T_from"] = f"T = <(u - <u>)^2>/d, u over neighbouring frames; {'; '.join(notes)}"
-    curve.check("T between frames {} and the next".format)
     for key in ("box_side", "frame_rate"):
         header.pop(key, None)
     return curve, questions
@@ -521,8 +522,8 @@ def curve_of_trajectory(
     if not rows:
         raise ValueError("it has no frames")
     fields = {name: jnp.asarray([row[name] for row in rows if name in row]) for name in rows[0]}
-    curve = CoolingCurve(**fields)  # type: ignore[arg-type]
-    curve.check("frame {}".format)
+    check_values(fields, place="frame {}".format)
+    curve = CoolingCurve(**fields)
     if curve.times[0] == 0:
         header.setdefault("T0", repr(rows[0]["temperature"]))
     header["T_from"] = "T = <v^2>/d of the particles of each frame, in the frame at rest"

@@ -523,6 +523,7 @@ def _as_curve(m: CurveRows, computed: dict[str, Any]) -> CoolingCurve:
     if m.scene.container is not None:
         absent += ("displacement", "diffusion")
     fields = {name: x for name, x in computed.items() if name not in absent}
+    fields["status"] = np.zeros((), int)
     return CoolingCurve(times=m.curve.times, **as_jax_arrays(fields))
 
 
