@@ -328,6 +328,11 @@ class CoolingCurve(eqx.Module):
                 f"a curve needs at least {MIN_POINTS} points, got {shape[0]}; measure the cooling "
                 "at more times"
             )
+        if np.sum(above_noise(self)) < MIN_POINTS:
+            raise ValueError(
+                f"T is more than {NOISE:g} errors above 0 at fewer than {MIN_POINTS} times; "
+                "measure hotter gases, or with smaller errors"
+            )
         if np.shape(self.temperature) != shape:
             raise ValueError(
                 f"temperature has shape {np.shape(self.temperature)}, but there are {shape[0]} "
@@ -397,6 +402,18 @@ def _check_signs(
     raise ValueError(
         f"{place(i)}: {column} is {values[i]:g}, it must be a positive number{zero}; {advice}"
     )
+
+
+NOISE = 3.0
+"""T over its error below which a row does not count as above the noise."""
+
+
+def above_noise(curve: CoolingCurve) -> np.ndarray:
+    """Return which rows can be compared in ln T without a model: all if every T is positive."""
+    T = np.asarray(curve.temperature)
+    if curve.temperature_error is None or np.all(T > 0):
+        return T > 0
+    return NOISE * np.asarray(curve.temperature_error) < T
 
 
 def _is_known(values: Any) -> bool:

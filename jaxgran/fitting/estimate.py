@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from jaxgran._utils import status
 from jaxgran._utils.tracing import as_jax_arrays
-from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.curve import CoolingCurve, above_noise
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import START_TIME, Measurement, Priors
 from jaxgran.fitting.alternatives import Explanations, compare_alternatives
@@ -530,7 +530,8 @@ def _as_curve(m: CurveRows, computed: dict[str, Any]) -> CoolingCurve:
 def described(gas: Gas, m: CurveRows) -> dict[str, float]:
     """Return numbers that describe a fitted gas: see `Fit.scales`."""
     N = m.measurement.num_particles
-    numbers = _scales(gas, float(m.values[-1, 0]), N or 1)
+    coolest = float(m.values[above_noise(m.curve), 0][-1])
+    numbers = _scales(gas, coolest, N or 1)
     described = {name: float(x) for name, x in numbers.items()}
     return described if N is not None else described | {"side": float("nan")}
 
