@@ -351,11 +351,12 @@ def _base_unit(name: str, units: dict[str, str] = UNITS) -> str | None:
 
 def _pop_units(header: dict[str, str]) -> dict[str, str]:
     """Remove the header keys of units; return the unit of numbers without one, by its SI unit."""
+    speed_given = "speed_unit" in header
     told = {key: header.pop(key, unit) for key, unit in UNIT_KEYS.items()}
     for key in told:
         _factor(key, told, {}, "header line")
     length, time, speed = told.values()
-    if speed == UNIT_KEYS["speed_unit"]:
+    if not speed_given:
         speed = f"{length}/{time}"
     return {
         "m": length,
