@@ -29,7 +29,14 @@ from jaxgran.fitting.parameters import (
 from jaxgran.fitting.prediction import Residuals
 from jaxgran.fitting.problem import Evaluation, Problem
 from jaxgran.fitting.result import Fit
-from jaxgran.fitting.rows import SCATTER, CurveRows, DropRows, curve_rows, with_rate_error
+from jaxgran.fitting.rows import (
+    SCATTER,
+    TINY,
+    CurveRows,
+    DropRows,
+    curve_rows,
+    with_rate_error,
+)
 from jaxgran.fitting.search import Descent, Minimum, best_of_starts, minimise
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import describe_walls
@@ -87,16 +94,39 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
         best, minima = best_of_starts(problem, first, max_steps, descent)
     check_computed(problem, best)
     explanations = None
-    if best.converged and not request.quick:
+    distant = distant_curves(problem, problem.evaluate(best.flat))
+    if distant:
+        notes = [*notes, say("distant", ratio=MAX_DISTANCE)]
+    elif best.converged and not request.quick:
         is_driven = any(m.scene.drive is not None for m in problem.curves)
         noise = np.zeros(problem.num_free)
         explanations = compare_alternatives(problem, minima, noise, request.absent, is_driven)
     trace = None if descent is None else descent.trace
     result = assembled(request, problem, best, minima, explanations, trace)
     share = measurement_share(problem, problem.evaluate(best.flat))
-    if result.p_value < SIGNIFICANCE / 2 and not request.quick:
+    if result.p_value < SIGNIFICANCE / 2 and not request.quick and not distant:
         notes += _of_outliers(problem, first, max_steps)
     return with_all_words(request, result, explanations, notes, share)
+
+
+MAX_DISTANCE = 3.0
+"""Factor between measured and fitted T from which on, if all values differ by it, the scale of T or
+of time is wrong."""
+
+
+def distant_curves(problem: Problem, found: Evaluation) -> list[str]:
+    """Return the labels of curves that no fit and no alternative comes near.
+
+    All alternatives begin at the same T_0: values that are all far off are in another unit, and the
+    search for an alternative would not end.
+    """
+    labels = []
+    for m in problem.curves:
+        T = m.values[:, 0][m.used[:, 0] > 0]
+        computed = found.curves[m.label]["temperature"][m.used[:, 0] > 0]
+        if np.all(np.abs(np.log(np.maximum(T, TINY) / computed)) > np.log(MAX_DISTANCE)):
+            labels.append(m.label)
+    return labels
 
 
 def _of_outliers(problem: Problem, first: np.ndarray, max_steps: int) -> Iterator[str]:

@@ -16,6 +16,7 @@ from jaxgran.data.curve import CoolingCurve, Run
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.particles.run import MIN_BOX
 from jaxgran.particles.setup import PACKING_LIMIT
+from jaxgran.particles.snapshot import nan_where
 from jaxgran.scene.elements import VOLUME_TOLERANCE, container_volume_ratio
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import NODES
@@ -262,15 +263,18 @@ def valid_where_traced(
         The gas, nan where a traced float is out of range; the times, replaced if traced ones do not
         increase from 0 or later; and True if all values were allowed, None if nothing is traced.
     """
-    if all(map(is_known, (times, *jax.tree.leaves(gas)))):
+    if not any_traced(gas, times):
         return gas, times, None
+    # Also values that are known and only carry a tangent, which `Gas` does not check.
     traced = {name: gas.value(name) for name in gas.domains}
-    traced = {name: value for name, value in traced.items() if not is_known(value)}
+    traced = {name: value for name, value in traced.items() if any_traced(value)}
     allowed = jnp.ones((), bool)
     for name, value in traced.items():
         allowed &= jnp.all(gas.domains[name].contains(value))
-    gas = gas.replace(**{name: jnp.where(allowed, x, jnp.nan) for name, x in traced.items()})
-    if not is_known(times):
+    one_or_nan = jnp.where(allowed, 1.0, jnp.nan)
+    # A product, so that derivatives are nan, too: an optimiser would take 0 for a minimum.
+    gas = gas.replace(**{name: x * one_or_nan.astype(x.dtype) for name, x in traced.items()})
+    if any_traced(times):
         increase = jnp.all(jnp.diff(times) > 0) & (times[0] >= 0) & jnp.isfinite(times[-1])
         allowed &= increase
         times = jnp.where(increase, times, jnp.arange(1.0, 1.0 + times.size, dtype=times.dtype))
@@ -284,9 +288,7 @@ def nan_unless(
     if allowed is None:
         return curve
     fault = status.flag(status.OUT_OF_RANGE, ~allowed)
-    masked = jax.tree.map(
-        lambda x: jnp.where(allowed, x, jnp.nan) if eqx.is_inexact_array(x) else x, curve
-    )
+    masked = jax.tree.map(lambda x: nan_where(~allowed, x), curve)
     fault = fault if curve.status is None else jnp.where(allowed, curve.status, fault)
     return dataclasses.replace(masked, times=times, status=fault)
 
