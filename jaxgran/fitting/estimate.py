@@ -603,6 +603,8 @@ def with_all_words(
         for limitation in request.model.limitations(gas, N):
             if limitation.words not in {known.words for known in limitations}:
                 limitations.append(limitation)
+        if gas.container is not None:
+            notes.append(say("gravity"))
         if N is not None and gas.container is None and "walls" not in request.absent:
             prefix = f"{label}: " if label else ""
             notes.append(f"{prefix}the box of {N} spheres {describe_walls(gas, N)}")
