@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxgran.data.curve import CoolingCurve, import_extra
+from jaxgran.data.curve import CoolingCurve, above_noise, import_extra
 from jaxgran.data.files import write_atomically
 from jaxgran.fitting.result import Fit
 
@@ -114,7 +114,8 @@ def plot_fit(result: Fit, axes: Any = None) -> np.ndarray:
             "matplotlib.pyplot.subplots(2, sharex=True)."
         )
     _draw_fit(axes, result, "temperature")
-    T = np.asarray(_measured(result).temperature)
+    curve = _measured(result)
+    T = np.asarray(curve.temperature)[above_noise(curve)]
     axes[0].set_ylim(0.6 * float(T[-1]), 1.6 * float(T.max()))
     _draw_power_laws(axes[0], result.curve)
     axes[0].legend(frameon=False, loc="lower left")

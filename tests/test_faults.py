@@ -7,7 +7,9 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +17,10 @@ import pytest
 
 import jaxgran
 from jaxgran import Run
+from jaxgran._utils import tracing
+from jaxgran.data import checkpoint
 from jaxgran.particles import dynamics as moving
+from jaxgran.particles import run as particle_run
 from jaxgran.particles.run import block_until_ready, in_thread, run_through_times
 from tests.beads import glass_beads, spheres
 
@@ -232,3 +237,100 @@ def test_files_keep_permissions_and_follow_links(tmp_path):
     finally:
         os.umask(old)
     assert (tmp_path / "new.csv").stat().st_mode & 0o777 == 0o644
+
+
+# --- derivatives of values that are nan ----------------------------------------------------------
+
+NAN_MODELS = [
+    jaxgran.KineticTheory(),
+    pytest.param(jaxgran.DSMC(20, replicas=2), marks=pytest.mark.slow),
+    pytest.param(jaxgran.HardSpheres(20), marks=pytest.mark.slow),
+    pytest.param(jaxgran.SoftSpheres(20).sized_for(GAS), marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize("model", NAN_MODELS, ids=lambda model: type(model).__name__)
+@pytest.mark.parametrize(
+    "name, value", [("packing_fraction", 0.8), ("dissipative_constant", -1e-6)]
+)
+def test_derivatives_are_nan_where_values_are(model, name, value):
+    def temperature(x):
+        return cool(GAS.replace(**{name: x}), model=model, throw=False).temperature[0]
+
+    def forward(x):
+        return jax.jvp(temperature, (x,), (jnp.ones_like(x),))
+
+    reverse = jax.value_and_grad(temperature)
+    x, allowed = jnp.asarray(value), GAS.value(name)
+    for found in (forward(x), reverse(x), jax.jit(reverse)(x)):
+        assert np.all(np.isnan(found))
+    for both in (forward, reverse):
+        found = np.asarray(jax.vmap(both)(jnp.stack([x, allowed])))
+        assert np.all(np.isnan(found[:, 0])) and np.all(np.isfinite(found[:, 1]))
+
+
+def test_a_solver_that_fails_has_no_derivative():
+    model = jaxgran.KineticTheory(max_steps=2)
+    times = TAU * jnp.asarray([1.0, 1e4])
+
+    def temperature(A):
+        return cool(GAS.replace(dissipative_constant=A), times, model=model).temperature[-1]
+
+    assert np.all(np.isnan(jax.jit(jax.value_and_grad(temperature))(GAS.dissipative_constant)))
+
+
+def test_what_tree_at_changed_is_checked():
+    gas = eqx.tree_at(lambda gas: gas.diameter, GAS, jnp.asarray(-1.0))
+    with pytest.raises(ValueError, match="diameter must lie in"):
+        cool(gas)
+
+
+# --- limits --------------------------------------------------------------------------------------
+
+
+class Moving(NamedTuple):
+    time: jax.Array
+
+
+def test_a_termination_saves_the_run_and_then_ends_the_process(tmp_path, monkeypatch):
+    ended = []
+    monkeypatch.setattr(checkpoint.signal, "raise_signal", ended.append)
+    path = tmp_path / "run.ckpt"
+    times = np.asarray([0.4, 1.0])
+
+    def advance(state, end):
+        if 0.4 < state.time < 0.6:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return Moving(state.time + 0.1)
+
+    def run(advance):
+        arguments = Moving(jnp.zeros(())), times, advance, lambda state: {"temperature": state.time}
+        return run_through_times(*arguments, path=path, progress=False)
+
+    with pytest.raises(KeyboardInterrupt), checkpoint.saved_at_termination(path):
+        run(advance)
+    assert ended == [signal.SIGTERM] and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    steps = []
+    _, records, _ = run(lambda state, end: steps.append(0) or Moving(state.time + 0.1))
+    assert len(steps) < 7 and records["temperature"][-1] >= 1.0
+
+
+def test_programs_are_dropped_before_the_limit_of_memory_maps(monkeypatch):
+    cleared = []
+    monkeypatch.setattr(jax, "clear_caches", lambda: cleared.append(0))
+    monkeypatch.setattr(tracing, "MAX_MAP_SHARE", 0.0)
+    if not Path("/proc/self/maps").exists():
+        pytest.skip("not Linux")
+    for _ in range(2):
+        with particle_run.compiling("a program", False):
+            pass
+    assert len(cleared) == 1
+
+
+@pytest.mark.slow
+def test_a_gas_that_never_collides_is_equilibrated_at_once():
+    gas = GAS.replace(packing_fraction=1e-12)
+    began = time.monotonic()
+    curve = cool(gas, [1.0], model=jaxgran.HardSpheres(20))
+    assert time.monotonic() - began < 100  # compilation included
+    np.testing.assert_allclose(curve.temperature, gas.temperature)

@@ -77,9 +77,20 @@ def test_a_frame_has_a_row_for_each_time(curve):
     assert set(table.columns) == {"temperature", "temperature_error", "collisions"}
 
 
+def test_a_table_of_pandas_comes_back(curve):
+    again = jaxgran.CoolingCurve.from_pandas(curve.to_pandas())
+    np.testing.assert_array_equal(again.times, curve.times)
+    np.testing.assert_array_equal(again.temperature_error, curve.temperature_error)
+    table = curve.to_pandas().reset_index().rename(columns={"times": "t", "temperature": "T"})
+    named = jaxgran.CoolingCurve.from_pandas(table)
+    np.testing.assert_array_equal(named.temperature, curve.temperature)
+    with pytest.raises(ValueError, match="the column speed is not of a curve"):
+        jaxgran.CoolingCurve.from_pandas(table.rename(columns={"T": "speed"}))
+
+
 def test_every_quantity_of_a_curve_has_a_unit(curve):
     no_number = ("replicas", "particles", "status", "saved", "saved_error")
-    numbers = {name: jnp.arange(4.0) for name in vars(curve) if name not in no_number}
+    numbers = {name: jnp.arange(1.0, 5.0) for name in vars(curve) if name not in no_number}
     data = jaxgran.CoolingCurve(**numbers).to_xarray()
     assert len(data.variables) == len(numbers) > 10
     assert all(x.attrs["units"] for x in data.variables.values())

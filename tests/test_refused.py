@@ -236,7 +236,10 @@ CALLS = [
     (lambda: cool(model=SOFT, save="velocity"), 'a replica, or "particles"'),
     (lambda: cool(save=lambda p: 1), "KineticTheory has no particles"),
     # measurements
-    (lambda: measured(None), "data must be a jaxgran.CoolingCurve or a jaxgran.DropTest, got None"),
+    (
+        lambda: measured(None),
+        "data must be a jaxgran.CoolingCurve or a jaxgran.DropTest, got NoneType",
+    ),
     (lambda: measured((TIMES, T)), "Make a curve of arrays by jaxgran.CoolingCurve.t, T."),
     (lambda: measured(gas=None), "gas must be a jaxgran.Gas, got None"),
     (lambda: measured(num_particles=-5), "num_particles must be a whole number >= 1, an int, got"),

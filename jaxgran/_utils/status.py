@@ -41,7 +41,8 @@ STEP_TOO_LARGE = Fault(
 NOT_FINITE = Fault(
     16,
     "a position or velocity is not a finite number",
-    "check the initial state for coincident spheres and for values outside their range",
+    "check the initial state for coincident spheres, and values of the gas that are so small or "
+    "large that their powers are 0 or infinite",
 )
 STALLED = Fault(
     32,

@@ -1,5 +1,6 @@
 """Values that a JAX transformation traces, and operations on concrete arrays."""
 
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -80,6 +81,24 @@ def grid_size(size: int) -> int:
     Arrays are padded to it, so that few lengths are compiled.
     """
     return max(32, 1 << (size - 1).bit_length())
+
+
+MAX_MAP_SHARE = 0.7
+"""Share of the memory maps that Linux allows a process, beyond which programs are dropped."""
+
+
+def near_map_limit() -> bool:
+    """Return whether this process has nearly as many memory maps as Linux allows.
+
+    XLA crashes at the limit, by default 65,530. A program of spheres has up to 900 maps.
+    """
+    try:
+        allowed = int(Path("/proc/sys/vm/max_map_count").read_text())
+        with open("/proc/self/maps", "rb") as file:
+            used = sum(1 for _ in file)
+    except OSError:  # not Linux
+        return False
+    return used > MAX_MAP_SHARE * allowed
 
 
 def fast_compilation(backend: str) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Validation of user input, and the map from an interval to an unconstrained parameter."""
 
+import datetime
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -112,7 +113,7 @@ FRACTION = Domain(low=0.0, high=1.0, low_allowed=True, high_allowed=True)
 ANY = Domain()
 
 
-def float_array(value: UserNumber, name: str = "") -> Float[Array, "..."]:
+def float_array(value: UserNumber, name: str = "", unit: str = "") -> Float[Array, "..."]:
     """Convert a number or a list of numbers to a JAX array of the default float type.
 
     The array is strongly typed, so that two Python floats do not cause two compilations.
@@ -120,15 +121,20 @@ def float_array(value: UserNumber, name: str = "") -> Float[Array, "..."]:
     Args:
         value: any shape.
         name: of the value, for messages.
+        unit: of the value, SI, to which quantities with units are converted.
 
     Raises:
         ValueError: if the value cannot be converted.
     """
+    value = in_si(value, unit)
     if np.ma.is_masked(value):
         of = f" of {name}" if name else ""
         raise ValueError(f"some values{of} are masked. Leave these points out of all quantities.")
     try:
-        if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value)):
+        leaves = jax.tree.leaves(value)
+        if any(isinstance(leaf, jax.Array) for leaf in leaves):
+            if not all(_is_real(leaf) for leaf in leaves):
+                raise TypeError
             return jnp.asarray(value, dtype=jnp.result_type(float))
         return jnp.asarray(_floats(value), dtype=jnp.result_type(float))
     except (TypeError, ValueError):
@@ -136,17 +142,56 @@ def float_array(value: UserNumber, name: str = "") -> Float[Array, "..."]:
         raise ValueError(f"{what} a number or an array of numbers, got {value!r:.60}") from None
 
 
-def number_named(name: str) -> Callable[[UserNumber], Array]:
+def number_named(name: str, unit: str = "") -> Callable[[UserNumber], Array]:
     """Return a converter of `equinox.field` to a float array; `name` is that in messages."""
-    return partial(float_array, name=name)
+    return partial(float_array, name=name, unit=unit)
 
 
 def _floats(value: Any) -> np.ndarray:
     """Convert to NumPy floats; raise TypeError or ValueError for strings, booleans and the like."""
-    array = np.asarray(value)
-    if array.dtype.kind not in "iuf" and not jnp.issubdtype(array.dtype, jnp.floating):
+    array = np.asarray(in_si(value))
+    if not _is_real(array):
         raise TypeError
     return array.astype(float)
+
+
+def _is_real(array: Any) -> bool:
+    """Return whether an array or a number holds real numbers, and not booleans."""
+    dtype = jnp.result_type(array)
+    return jnp.issubdtype(dtype, jnp.integer) or jnp.issubdtype(dtype, jnp.floating)
+
+
+def in_si(value: Any, unit: str = "") -> Any:
+    """Return the numbers of a quantity with a unit in SI; other values unchanged.
+
+    Args:
+        value: of any type. Known are quantities of pint, astropy and unyt, and time differences.
+        unit: SI unit, which quantities are converted to; if "", they are converted to base units.
+
+    Raises:
+        ValueError: for dates, and for a quantity that cannot have this unit.
+    """
+    if type(value) in (list, tuple):
+        return [in_si(part, unit) for part in value]
+    value = getattr(value, "data", value) if hasattr(value, "dims") else value  # of xarray
+    kind = getattr(getattr(value, "dtype", None), "kind", "")
+    if kind == "M" or isinstance(value, datetime.date):
+        raise ValueError(
+            "got dates, and times are in seconds since the gas began to cool. Subtract the first "
+            "one: dates - dates[0]"
+        )
+    if isinstance(value, datetime.timedelta):
+        return value.total_seconds()
+    if kind == "m":
+        return np.asarray(value) / np.timedelta64(1, "s")
+    to_base = next((x for x in ("to_base_units", "decompose", "in_mks") if hasattr(value, x)), None)
+    if to_base is None or not hasattr(value, "to"):
+        return value
+    try:
+        converted = value.to(unit.replace("^", "**")) if unit else getattr(value, to_base)()
+    except Exception as error:  # each library raises errors of its own
+        raise ValueError(f"expected a quantity in {unit}: {error}") from None
+    return converted.magnitude if hasattr(converted, "magnitude") else converted.value
 
 
 def python_int(value: Any) -> Any:
@@ -199,9 +244,11 @@ def check_bool(**values: Any) -> None:
             raise ValueError(f"{name} must be True or False, got {value!r}")
 
 
-def list_to_array(value: Any) -> Any:
-    """Convert a list, tuple or NumPy array of numbers to a JAX array; return others unchanged."""
-    return float_array(value) if isinstance(value, list | tuple | np.ndarray) else value
+def list_to_array(value: Any, unit: str = "") -> Any:
+    """Convert a list or an array of any library to a JAX array; return others unchanged."""
+    value = in_si(value, unit)
+    is_foreign = hasattr(value, "__array__") and not isinstance(value, jax.Array)
+    return float_array(value) if isinstance(value, list | tuple) or is_foreign else value
 
 
 def checked_times(times: UserNumber) -> Float[Array, "times"]:
@@ -218,7 +265,7 @@ def checked_times(times: UserNumber) -> Float[Array, "times"]:
     if isinstance(times, Tracer):
         return times.astype(jnp.result_type(float))
     try:
-        numbers = _floats(times).astype(jnp.result_type(float))
+        numbers = _floats(in_si(times, "s")).astype(jnp.result_type(float))
     except (TypeError, ValueError):
         raise ValueError(f"times must be a list of numbers, got {times!r}") from None
     if numbers.ndim != 1 or numbers.size == 0:

@@ -46,6 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
+            # A damaged cache is compiled again.
+            warnings.filterwarnings("ignore", "Error (read|writ)ing persistent compilation cache")
             warnings.showwarning = lambda text, *_: print(f"check: {text}", file=sys.stderr)
             APP(words, exit_on_error=False, print_error=False, result_action="return_value")
         sys.stdout.flush()
@@ -107,7 +109,7 @@ def cool(
     Args:
         scene: TOML file with eta, diameter, density, Y, nu, T0 and A (SI), or the CSV file of a
             curve with these keys in its header.
-        until: Last time, s; by default the times are those of the CSV file.
+        until: Last time, s; needed for a TOML file, by default the times are those of the CSV file.
         model: Model to use.
         particles: Number of particles per replica (particle models only; default: N from the
             scene).
@@ -156,22 +158,29 @@ def choose(
 
     Args:
         scene: TOML file with eta, diameter, density, Y, nu, T0 and A (SI), and N for a gas in a
-            box, or the CSV file of a curve with these keys in its header.
-        until: Last time, s; by default that of the CSV file.
+            box, or the CSV file of a curve with these keys in its header. Without A that of a fit
+            of the curve is used.
+        until: Last time, s; needed for a TOML file, by default that of the CSV file.
         tolerance: Allowed relative error of T.
         no_cache: Disable the compilation cache (same as JAXGRAN_NO_CACHE=1).
     """
     common.check_tolerance(tolerance)
     if not no_cache:
         common.use_compilation_cache()
-    given = _read_scene(scene, until)
+    given = _read_scene(scene, until, fits_A=True)
     choice = jaxgran.choose_model(given.gas, given.times, tolerance, given.size)
     for reason in choice.reasons:
         print(reason)
 
 
-def _read_scene(path: Path, until: float | None) -> SimpleNamespace:
-    """Return the gas, the times, N (size) and the header of a scene."""
+def _read_scene(path: Path, until: float | None, fits_A: bool = False) -> SimpleNamespace:
+    """Return the gas, the times, N (size) and the header of a scene.
+
+    Args:
+        path: of a TOML file or a curve.
+        until: the last time, s.
+        fits_A: whether A is that of a fit where a curve has none.
+    """
     times = None
     if path.suffix == ".toml":
         with name_in_errors(path):
@@ -179,7 +188,16 @@ def _read_scene(path: Path, until: float | None) -> SimpleNamespace:
                 values = tomllib.loads(read_text(path, "eta, diameter, ..."))
             except tomllib.TOMLDecodeError as error:
                 raise ValueError(f"not TOML ({error}). Write lines such as eta = 0.05.") from None
-            header = header_in_si({key: str(value) for key, value in values.items()})
+            if tables := [key for key, value in values.items() if isinstance(value, dict)]:
+                raise ValueError(
+                    f"[{tables[0]}] is not read: write all keys without tables, as container_side "
+                    "and wall_restitution for walls"
+                )
+            texts = {
+                key: " x ".join(map(str, value)) if isinstance(value, list) else str(value)
+                for key, value in values.items()
+            }
+            header = header_in_si(texts)
             gas, questions = gas_of_header(header)
         for question in questions:
             warnings.warn(f"{path}: {question}", stacklevel=2)
@@ -188,6 +206,13 @@ def _read_scene(path: Path, until: float | None) -> SimpleNamespace:
         header = dict(measurement.header)
         gas = measurement.gas
         times = measurement.curve.times
+        if "A" not in header and fits_A:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # on the fit
+                fitted = jaxgran.fit(measurement, quick=True)
+            gas = fitted.gas
+            header["A"] = repr(float(gas.value("dissipative_constant")))
+            print(f"A = {float(header['A']):.4g} s is that of a fit of this curve")
     if "A" not in header:
         raise ValueError(f"{path} does not give A, in s. Add it, or estimate it with jaxgran fit.")
     if until is not None:

@@ -12,8 +12,11 @@ import inspect
 import io
 import json
 import re
+import signal
+import threading
 import types
 from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -35,6 +38,50 @@ MAX_LISTED_VALUES = 4
 
 LIBRARIES = ("jaxgran.", "equinox.", "builtins.", "typing.", "abc.", "collections.")
 """Beginnings of names of classes and functions that the versions of packages describe."""
+
+
+_TERMINATED = threading.Event()
+"""Set by SIGTERM during a run that writes checkpoints."""
+
+
+class Termination(KeyboardInterrupt):
+    """SIGTERM during a run that writes checkpoints."""
+
+
+def stop_if_terminated() -> None:
+    """Raise `Termination` after SIGTERM: Python drops errors of signals within callbacks."""
+    if _TERMINATED.is_set():
+        raise Termination
+
+
+@contextmanager
+def saved_at_termination(path: str | Path | None) -> Iterator[None]:
+    """Let SIGTERM end a run as Ctrl-C does, with a checkpoint: batch systems send it.
+
+    The process then ends by that signal. A handler of the user stays, and nothing changes in other
+    threads than the main one.
+
+    Args:
+        path: of the checkpoint; None without one.
+    """
+    is_main = threading.current_thread() is threading.main_thread()
+    if path is None or not is_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+
+    def interrupt(*_: Any) -> None:
+        if not _TERMINATED.is_set():  # a second one must not interrupt the writing
+            _TERMINATED.set()
+            raise Termination
+
+    signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        if _TERMINATED.is_set():
+            _TERMINATED.clear()
+            signal.raise_signal(signal.SIGTERM)
 
 
 def save(path: str | Path, scene: dict[str, str], tree: Any) -> None:

@@ -99,14 +99,23 @@ class Particles(NamedTuple):
     angular_velocity: Float[Array, "replicas N spins"] | None = None
 
 
-_number_field = partial(eqx.field, converter=list_to_array)
+def _required(unit: str) -> Any:
+    return eqx.field(converter=partial(list_to_array, unit=unit))
+
+
+def _optional(unit: str) -> Any:
+    return eqx.field(converter=partial(list_to_array, unit=unit), default=None)
 
 
 class CoolingCurve(eqx.Module):
     """Temperature and further quantities of a cooling gas at given times, measured or computed.
 
     All arrays have the shape of `times`; those of `replicas` have the shape (replicas, times).
-    A quantity that is not known is None.
+    A quantity that is not known is None. Quantities with units of pint, astropy or unyt, and time
+    differences, are converted to SI. A curve without a status counts as measured: its values are
+    finite and positive. A value that has an error may be 0 or negative, as where noise was
+    subtracted. At t = 0, where the state of the gas was prepared, an error and a displacement may
+    be 0.
 
     Attributes:
         times: t, s, increasing.
@@ -144,28 +153,33 @@ class CoolingCurve(eqx.Module):
     ((3,), True)
     """
 
-    times: Float[Array, "times"] = _number_field()
-    temperature: Float[Array, "... times"] = _number_field()
-    displacement: Float[Array, "... times"] | None = _number_field(default=None)
-    sonine: Float[Array, "... times"] | None = _number_field(default=None)
-    third_sonine: Float[Array, "... times"] | None = _number_field(default=None)
-    collisions: Float[Array, "... times"] | None = _number_field(default=None)
-    diffusion: Float[Array, "... times"] | None = _number_field(default=None)
-    temperature_error: Float[Array, "... times"] | None = _number_field(default=None)
-    displacement_error: Float[Array, "... times"] | None = _number_field(default=None)
-    rotational_temperature: Float[Array, "... times"] | None = _number_field(default=None)
-    rotational_temperature_error: Float[Array, "... times"] | None = _number_field(default=None)
-    velocity_correlation: Float[Array, "... times"] | None = _number_field(default=None)
-    elastic_energy: Float[Array, "... times"] | None = _number_field(default=None)
-    dissipated_energy: Float[Array, "... times"] | None = _number_field(default=None)
-    regularised: Float[Array, "... times"] | None = _number_field(default=None)
-    flow_share: Float[Array, "... times"] | None = _number_field(default=None)
-    derivative_bias: Float[Array, "... times"] | None = _number_field(default=None)
+    times: Float[Array, "times"] = _required("s")
+    temperature: Float[Array, "... times"] = _required("m^2/s^2")
+    _: dataclasses.KW_ONLY
+    displacement: Float[Array, "... times"] | None = _optional("m^2")
+    sonine: Float[Array, "... times"] | None = _optional("")
+    third_sonine: Float[Array, "... times"] | None = _optional("")
+    collisions: Float[Array, "... times"] | None = _optional("")
+    diffusion: Float[Array, "... times"] | None = _optional("m^2/s")
+    temperature_error: Float[Array, "... times"] | None = _optional("m^2/s^2")
+    displacement_error: Float[Array, "... times"] | None = _optional("m^2")
+    rotational_temperature: Float[Array, "... times"] | None = _optional("m^2/s^2")
+    rotational_temperature_error: Float[Array, "... times"] | None = _optional("m^2/s^2")
+    velocity_correlation: Float[Array, "... times"] | None = _optional("m^2/s^2")
+    elastic_energy: Float[Array, "... times"] | None = _optional("J")
+    dissipated_energy: Float[Array, "... times"] | None = _optional("J")
+    regularised: Float[Array, "... times"] | None = _optional("")
+    flow_share: Float[Array, "... times"] | None = _optional("")
+    derivative_bias: Float[Array, "... times"] | None = _optional("")
     replicas: "CoolingCurve | None" = None
     particles: Particles | None = None
     saved: Any = None
     saved_error: Any = None
     status: Int[Array, ""] | None = None
+
+    def __check_init__(self) -> None:
+        if _is_known(self.times):
+            check_values({name: getattr(self, name) for name in QUANTITIES}, self.status)
 
     def __repr__(self) -> str:
         first = format_quantity(self.times[..., 0], "s")
@@ -230,6 +244,32 @@ class CoolingCurve(eqx.Module):
         columns = {name: np.asarray(x) for name, x in known.items() if x is not None}
         return pandas.DataFrame(columns).set_index("times")
 
+    @classmethod
+    def from_pandas(cls, frame: Any) -> "CoolingCurve":
+        """Return the curve of a table that `to_pandas` made, or of one with columns named alike.
+
+        Args:
+            frame: a `pandas.DataFrame` with columns that have the names of fields, as temperature
+                and temperature_error, or of the columns of files, as T and T_err, SI; times are a
+                column or the index.
+
+        Raises:
+            ValueError: for a column that is neither.
+
+        >>> again = jaxgran.CoolingCurve.from_pandas(curve.to_pandas())
+        >>> bool(jnp.all(again.temperature == curve.temperature))
+        True
+        """
+        known = {quantity.column: name for name, quantity in QUANTITIES.items()}
+        columns = frame if {"t", "times"} & {*frame.columns} else frame.reset_index(names="times")
+        fields = {known.get(name, name): columns[name].to_numpy() for name in columns.columns}
+        if unknown := [str(name) for name in fields if name not in QUANTITIES]:
+            raise ValueError(
+                f"the column {unknown[0]} is not of a curve: rename or drop it. Known are "
+                f"{', '.join(known)}, and the names of the fields of CoolingCurve"
+            )
+        return cls(**fields)
+
     def check_single(self) -> None:
         """Raise ValueError for several curves in one, as `jax.vmap` returns them."""
         if np.ndim(self.times) != 1:
@@ -274,50 +314,112 @@ class CoolingCurve(eqx.Module):
             replicas=dataclasses.replace(self.replicas, saved=each),
         )
 
-    def check(self, place: Callable[[int], str] = "point {}".format) -> None:
-        """Check that this can be a measured curve: finite and positive values, increasing times.
-
-        At t = 0, where the state of the gas was prepared, an error and a displacement may be 0.
-
-        Args:
-            place: returns the name of a point, given its index, for error messages.
-
-        Raises:
-            ValueError: naming the first wrong point, and saying what to do.
-        """
-        times = np.asarray(self.times)
-        if times.ndim != 1 or times.size < MIN_POINTS:
+    def check_measured(self) -> None:
+        """Raise ValueError unless this is one curve of at least `MIN_POINTS` times."""
+        shape = np.shape(self.times)
+        if len(shape) != 1:
+            column = "; make columns lists, as by x.ravel()" if shape[-1:] == (1,) else ""
             raise ValueError(
-                f"a curve needs at least {MIN_POINTS} points, got {times.size}; "
-                "measure the cooling at more times"
+                f"times of a measured curve have one axis, got shape {shape}{column}; of several "
+                "curves take one, as in jax.tree.map(lambda x: x[0], curves)"
             )
-        for quantity in QUANTITIES.values():
-            values = getattr(self, quantity.field)
-            if values is None:
-                continue
-            if np.shape(values) != times.shape:
-                raise ValueError(
-                    f"{quantity.column} has shape {np.shape(values)}, but there are {times.size} "
-                    "times; give one value for each time"
-                )
-            values, column = np.asarray(values), quantity.column
-            zero_allowed = np.zeros(times.shape, bool)
-            zero_allowed[0] = column != "T" and (column == "t" or times[0] == 0)
-            wrong = ~np.isfinite(values) | ~((values > 0) | zero_allowed & (values == 0))
-            if quantity.measured and np.any(wrong):
-                i = int(np.argmax(wrong))
-                zero = " (zero is allowed only in a first row at t = 0)" if column != "T" else ""
-                raise ValueError(
-                    f"{place(i)}: {column} is {values[i]:g}, it must be a positive number{zero}; "
-                    "correct or remove this row"
-                )
-        not_later = np.flatnonzero(np.diff(times) <= 0)
-        if not_later.size:
-            i = int(not_later[0]) + 1
+        if shape[0] < MIN_POINTS:
             raise ValueError(
-                f"{place(i)}: t is {times[i]:g} after {times[i - 1]:g}; times must increase: "
-                "sort the rows by time and remove repeated ones"
+                f"a curve needs at least {MIN_POINTS} points, got {shape[0]}; measure the cooling "
+                "at more times"
             )
+        if np.sum(above_noise(self)) < MIN_POINTS:
+            raise ValueError(
+                f"T is more than {NOISE:g} errors above 0 at fewer than {MIN_POINTS} times; "
+                "measure hotter gases, or with smaller errors"
+            )
+        if np.shape(self.temperature) != shape:
+            raise ValueError(
+                f"temperature has shape {np.shape(self.temperature)}, but there are {shape[0]} "
+                "times; give one value for each time"
+            )
+
+
+def check_values(
+    fields: dict[str, Any], status: Any = None, place: Callable[[int], str] = "point {}".format
+) -> None:
+    """Check the lengths of the fields of a curve, and the values of a measured one.
+
+    Args:
+        fields: by name; times are known.
+        status: of a computed curve, the values of which are not checked.
+        place: returns the name of a point, given its index, for error messages.
+
+    Raises:
+        ValueError: naming the first wrong point, and saying what to do.
+    """
+    times = np.asarray(fields["times"])
+    known = {name: fields[name] for name in QUANTITIES if fields.get(name) is not None}
+    for name, values in known.items():
+        if np.shape(values)[-1:] != times.shape[-1:]:
+            raise ValueError(
+                f"{name} has shape {np.shape(values)}, but times have shape {times.shape}; give "
+                "one value for each time"
+            )
+    if status is not None or times.ndim != 1:
+        return
+    for name, values in known.items():
+        if QUANTITIES[name].measured and _is_known(values) and np.ndim(values) == 1:
+            error = known.get(f"{name}_error")
+            error = np.asarray(error) if _is_known(error) else np.zeros(1)
+            _check_signs(QUANTITIES[name], np.asarray(values), error, times, place)
+    not_later = np.flatnonzero(np.diff(times) <= 0)
+    if not_later.size:
+        i = int(not_later[0]) + 1
+        raise ValueError(
+            f"{place(i)}: t is {times[i]:g} after {times[i - 1]:g}; times must increase: sort "
+            "the rows by time and remove repeated ones"
+        )
+
+
+def _check_signs(
+    quantity: Quantity,
+    values: np.ndarray,
+    error: np.ndarray,
+    times: np.ndarray,
+    place: Callable[[int], str],
+) -> None:
+    column = quantity.column
+    zero_allowed = np.zeros(values.shape, bool)
+    zero_allowed[:1] = column != "T" and (column == "t" or times[0] == 0)
+    allowed = (values > 0) | (error > 0) | (zero_allowed & (values == 0))
+    wrong = ~(np.isfinite(values) & allowed)
+    if not np.any(wrong):
+        return
+    i = int(np.argmax(wrong))
+    zero = " (zero is allowed only in a first row at t = 0)" if column != "T" else ""
+    advice = "correct or remove this row"
+    if quantity in WITH_ERRORS and values[i] <= 0:
+        advice += (
+            f"; if noise was subtracted, give {quantity.error.column}: {column} may then be "
+            "negative, and rows that are left out make A wrong"
+        )
+    raise ValueError(
+        f"{place(i)}: {column} is {values[i]:g}, it must be a positive number{zero}; {advice}"
+    )
+
+
+NOISE = 3.0
+"""T over its error below which a row does not count as above the noise."""
+
+
+def above_noise(curve: CoolingCurve) -> np.ndarray:
+    """Return which rows can be compared in ln T without a model: all if every T is positive."""
+    T = np.asarray(curve.temperature)
+    if curve.temperature_error is None or np.all(T > 0):
+        return T > 0
+    return NOISE * np.asarray(curve.temperature_error) < T
+
+
+def _is_known(values: Any) -> bool:
+    """Return whether values are numbers, and neither traced nor None nor a placeholder."""
+    is_array = isinstance(values, jax.Array | np.ndarray)
+    return is_array and not isinstance(values, jax.core.Tracer)
 
 
 class Run(NamedTuple):

@@ -8,8 +8,7 @@ import io
 import json
 import warnings
 import zipfile
-from collections.abc import Callable
-from math import pi
+from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,29 +17,17 @@ import numpy as np
 
 from jaxgran._utils.validation import check_bool
 from jaxgran.data import files, tracks
-from jaxgran.data.curve import QUANTITIES, CoolingCurve, from_arrays, to_arrays
+from jaxgran.data.curve import QUANTITIES, CoolingCurve, check_values, from_arrays, to_arrays
+from jaxgran.data.definitions import BY_COLUMN, TEMPERATURE_COLUMNS
 from jaxgran.data.drop_test import DROP_TEST_COLUMNS, DropTest
 from jaxgran.data.header import checked_header, gas_or_none, header_choice
-from jaxgran.data.questions import ask_about_columns
+from jaxgran.data.questions import ask_about_columns, ask_about_speeds, scene_of
 from jaxgran.data.tables import Table, header_entry, header_in_si, read_table
-from jaxgran.scene.geometry import sphere_mass
 
 WANTED = "t,T[,T_err][,msd][,msd_err]"
 """Columns of a file, for messages."""
 
 CSV_FILE = f"a CSV file with the columns {WANTED}"
-TEMPERATURE_COLUMNS: dict[str, tuple[int, Callable[..., np.ndarray], str]] = {
-    "mean_speed": (
-        2,
-        lambda v, d, m: (pi / 8 if d == 3 else 2 / pi) * v**2,
-        "(pi/8) <|v|>^2, in a plane (2/pi) <|v|>^2, for Maxwellian velocities",
-    ),
-    "vx2": (1, lambda x, d, m: x, "<v_x^2>, for isotropic velocities"),
-    "v2_xy": (1, lambda x, d, m: x / 2, "<v_x^2 + v_y^2>/2, for isotropic velocities"),
-    "energy": (1, lambda E, d, m: 2 * E / (d * m), "2 E/(d m), E in J per particle"),
-}
-"""Columns from which T = <v^2>/d is computed: their power in T, T of values, d and m, words."""
-
 ANY_MATERIAL = {"density": "1", "Y": "1", "nu": "0", "T0": "1"}
 """Header keys that the collision frequency over sqrt(T0) does not depend on."""
 
@@ -104,25 +91,30 @@ def read_data(path: Path, given: dict[str, str]) -> Content:
     """
     if path.suffix == ARCHIVE_SUFFIX:
         curve, header = _read_archive(path)
-        return Content(curve, header | header_in_si(given), [])
+        header = header | header_in_si(given)
+        return Content(curve, header, list(ask_about_columns(curve, header, gas_or_none(header))))
     if tracks.is_trajectory(path):
-        return Content(*tracks.curve_of_trajectory(path, header_in_si(given)), [])
+        curve, header = tracks.curve_of_trajectory(path, header_in_si(given))
+        return Content(curve, header, list(ask_about_columns(curve, header, gas_or_none(header))))
     table = read_table(path, WANTED, _columns_to_read, given)
     header = table.header
     columns = table.columns
     if "eps" in columns:
         onto = header_choice(header, "onto", ("sphere", "plate"))
         test = DropTest(columns["v"], columns["eps"], columns["eps_err"], onto == "plate")
-        return Content(test, header, [])
+        return Content(test, header, list(ask_about_speeds(test)))
     if "x" in columns:
         gas = gas_or_none(ANY_MATERIAL | header)
         curve, questions = tracks.curve_of_tracks(columns, header, table.lines, gas)
+        questions += ask_about_columns(curve, header, gas_or_none(header))
         return Content(curve, header, questions)
-    columns, rounding = _with_temperature(table, header)
+    columns, rounding, column = _with_temperature(table, header)
     fields = {quantity.column: quantity.field for quantity in QUANTITIES.values()}
-    curve = from_arrays({fields[name]: jnp.asarray(x) for name, x in columns.items()})
-    curve.check(lambda i: f"line {table.lines[i]}")
-    questions = list(ask_about_columns(curve, header, gas_or_none(header), rounding))
+    arrays = {fields[name]: jnp.asarray(x) for name, x in columns.items()}
+    check_values(arrays, place=lambda i: f"line {table.lines[i]}")
+    curve = from_arrays(arrays)
+    curve.check_measured()
+    questions = list(ask_about_columns(curve, header, gas_or_none(header), rounding, column))
     return Content(curve, header, questions, rounding)
 
 
@@ -140,6 +132,8 @@ def _columns_to_read(names: list[str]) -> list[str]:
     temperatures = [name for name in ("T", *TEMPERATURE_COLUMNS) if name in names]
     known = {quantity.column for quantity in QUANTITIES.values()}
     known |= {end for name in temperatures for end in (name, f"{name}_err")}
+    if "total_energy" in names:  # tables of energies have columns of other energies, too
+        names = [name for name in names if name in known]
     unknown = [name for name in names if name not in known]
     missing = ([] if "t" in names else ["t"]) + ([] if temperatures else ["T"])
     if len(temperatures) > 1:
@@ -159,47 +153,50 @@ def _columns_to_read(names: list[str]) -> list[str]:
 
 def _with_temperature(
     table: Table, header: dict[str, str]
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], str]:
     """Return columns with T = <v^2>/d in place of one of `TEMPERATURE_COLUMNS`.
 
     The velocities are taken for isotropic and Maxwellian. The entry T_from is added to the header.
 
     Returns:
-        The columns, and the last digits of T and T_rot by field.
+        The columns, the last digits of T and T_rot by field, and the column that gave T.
 
     Raises:
-        ValueError: for a value that is not positive, or an energy of particles of unknown mass.
+        ValueError: for a speed that is not positive, or an energy of particles of unknown mass.
     """
     columns = dict(table.columns)
     fields = {"T": "temperature", "T_rot": "rotational_temperature"}
     rounding = {fields[name]: table.last_digits(name) for name in fields.keys() & columns.keys()}
-    d = files.header_count(header, "dimension") or 3
-    mass = np.nan
-    for name in TEMPERATURE_COLUMNS.keys() & columns.keys():
-        values = columns.pop(name)
-        error = columns.pop(f"{name}_err", None)
-        if np.any(values <= 0):
-            i = int(np.argmax(values <= 0))
-            raise ValueError(
-                f"line {table.lines[i]}: {name} is {values[i]:g}, it must be a positive number; "
-                "correct or remove this row"
-            )
-        if name == "energy":
-            if not {"diameter", "density"} <= header.keys():
-                raise ValueError(
-                    "a column energy needs the mass of a particle: add diameter and density to the "
-                    "header, or give T = <v^2>/d itself"
-                )
-            size, density = (files.header_number(header, key) for key in ("diameter", "density"))
-            mass = float(sphere_mass(size, density))
-        power, temperature, words = TEMPERATURE_COLUMNS[name]
-        columns["T"] = temperature(values, d, mass)
-        header["T_from"] = f"T = {words}"
-        relative = power * columns["T"] / values
-        rounding["temperature"] = relative * table.last_digits(name)
-        if error is not None:
-            columns["T_err"] = relative * error
-    return columns, rounding
+    name = next((name for name in TEMPERATURE_COLUMNS if name in columns), "T")
+    if name == "T":
+        return columns, rounding, name
+    values = columns.pop(name)
+    error = columns.pop(f"{name}_err", None)
+    power = BY_COLUMN[name].power
+    if power > 1 and np.any(values <= 0):
+        i = int(np.argmax(values <= 0))
+        raise ValueError(
+            f"line {table.lines[i]}: {name} is {values[i]:g}, it must be a positive number; "
+            "correct or remove this row"
+        )
+    scene = scene_of(header)
+    if "energy" in name and np.isnan(scene.mass):
+        raise ValueError(
+            f"a column {name} needs the mass of a particle: add diameter and density to the "
+            "header, or give T = <v^2>/d itself"
+        )
+    if name == "total_energy" and np.isnan(scene.number):
+        raise ValueError("a column of the energy of all particles needs N: add it to the header")
+    factor = BY_COLUMN[name].factor(scene)
+    columns["T"] = factor * values**power
+    header["T_from"] = f"T = {factor:.4g} {name}{f'^{power}' * (power > 1)}: it is " + (
+        BY_COLUMN[name].words
+    )
+    slope = power * factor * values ** (power - 1)
+    rounding["temperature"] = slope * table.last_digits(name)
+    if error is not None:
+        columns["T_err"] = slope * error
+    return columns, rounding, name
 
 
 def write_curve(
@@ -230,6 +227,11 @@ def write_curve(
     check_bool(overwrite=overwrite)
     if not isinstance(curve, CoolingCurve):
         raise ValueError(f"curve must be a jaxgran.CoolingCurve, got {curve!r:.60}")
+    if path.suffix not in (ARCHIVE_SUFFIX, *CSV_SUFFIXES):
+        raise ValueError(
+            f"{path}: a curve is written as .npz or as text, {', '.join(CSV_SUFFIXES[:-1])}; "
+            "choose one of these endings"
+        )
     if path.exists() and not overwrite:
         raise ValueError(f"{path} exists; choose another name or set overwrite=True")
     if path.suffix == ARCHIVE_SUFFIX:
@@ -254,14 +256,31 @@ def write_curve(
 
 
 ARCHIVE_SUFFIX = ".npz"
+CSV_SUFFIXES = (".csv", ".txt", ".dat", "")
 
 HEADER_ENTRY = "header"
 """Entry of an npz file that holds the header, as JSON; all others are arrays."""
 
 
+def _check_sizes(content: io.BytesIO) -> None:
+    """Raise ValueError for an array that its entry of an npz file cannot hold, or for too much."""
+    with zipfile.ZipFile(content) as archive:
+        if sum(entry.file_size for entry in archive.infolist()) > files.MAX_BYTES:
+            raise ValueError(f"more than {files.MAX_BYTES:g} bytes unpacked")
+        for entry in archive.infolist():
+            with archive.open(entry) as file:
+                version = np.lib.format.read_magic(file)
+                read = np.lib.format.read_array_header_1_0
+                read = read if version == (1, 0) else np.lib.format.read_array_header_2_0
+                shape, _, dtype = read(file)
+            if prod(shape) * dtype.itemsize > entry.file_size:
+                raise ValueError(f"{entry.filename} is shorter than its header says")
+
+
 def _read_archive(path: Path) -> tuple[CoolingCurve, dict[str, str]]:
-    content = io.BytesIO(path.read_bytes())
+    content = io.BytesIO(files.read_bytes(path))
     try:
+        _check_sizes(content)
         with np.load(content, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         header = json.loads(str(arrays.pop(HEADER_ENTRY)))

@@ -40,9 +40,21 @@ def name_in_errors(path: Path) -> Iterator[None]:
         raise ValueError(f"{path}: {error}") from None
 
 
+MAX_BYTES = 2**30
+"""Largest size of a file, unpacked."""
+
+
 def read_bytes(path: Path) -> bytes:
-    """Return the content of a file, unpacked if its name ends in .gz."""
-    return gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+    """Return the content of a file, unpacked if its name ends in .gz.
+
+    Raises:
+        ValueError: for more than `MAX_BYTES`.
+    """
+    with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+        content = file.read(MAX_BYTES + 1)
+    if len(content) > MAX_BYTES:
+        raise ValueError(f"it has more than {MAX_BYTES:g} bytes; keep fewer times or columns")
+    return content
 
 
 def write_atomically(path: str | Path, write: Callable[[Any], Any]) -> None:
@@ -112,7 +124,7 @@ def header_number(header: Mapping[str, Any], key: str) -> float:
         KeyError: if there is no such key.
     """
     try:
-        number = float(header[key])
+        number = float("nan") if "_" in str(header[key]) else float(header[key])
     except (TypeError, ValueError):
         number = float("nan")
     if not np.isfinite(number):

@@ -110,8 +110,13 @@ def gas_of_header(header: dict[str, str]) -> tuple[Gas, list[str]]:
     """
     gas = make_gas(header)
     quantities = {*BY_SYMBOL, *PRIOR_KEYS}
-    numbers = [key for key in header if key in quantities and header[key] != GUESS]
-    questions = list(ask_about_header({key: files.header_number(header, key) for key in numbers}))
+    sides = {key: str(np.max(header_sides(header))) for key in header if key == "container_side"}
+    numbers = {
+        key: files.header_number(header | sides, key)
+        for key in header
+        if key in quantities and header[key] != GUESS
+    }
+    questions = list(ask_about_header(numbers))
     known = dict.fromkeys((*REQUIRED, *BY_SYMBOL, *OPTIONAL_KEYS, *UNIT_KEYS))
     others = {*known, *PRIOR_KEYS, *PROVENANCE_KEYS, *UNSUPPORTED_KEYS}
     # Comments that are no single word are not keys.
@@ -151,9 +156,10 @@ def make_gas(header: dict[str, str]) -> Gas:
     """Return the gas that a header describes: see `gas_of_header`."""
     d = files.header_count(header, "dimension") or 3
     if "eta" not in header and {"N", "container_side", "diameter"} <= header.keys():
-        size, side = (files.header_number(header, key) for key in ("diameter", "container_side"))
+        size = files.header_number(header, "diameter")
         sphere = pi / 6 * size**3 if d == 3 else pi / 4 * size**2
-        header = header | {"eta": repr(files.header_number(header, "N") * sphere / side**d)}
+        volume = np.prod(np.broadcast_to(header_sides(header), d))
+        header = header | {"eta": repr(float(files.header_number(header, "N") * sphere / volume))}
     missing = [key for key in REQUIRED if key not in header]
     if missing:
         raise ValueError(
@@ -189,7 +195,7 @@ def elements_of_header(header: dict[str, str]) -> dict[str, Any]:
             4 I/(m sigma^2), and T_rot_0, T_rot = I <w^2>/(d_rot m) at t = 0, m^2/s^2, and, if they
             slide, Coulomb's coefficient friction; for lasting contacts with friction
             tangential_damping and friction (`jaxgran.Frictional`, numbers without a unit) in place
-            of beta_t; for walls container_side, of a cube, m,
+            of beta_t; for walls container_side, of a cube, m, or "8 x 6 x 4 cm",
             wall_restitution and, for rough walls, wall_beta_t; for drag gamma, 1/s, of
             dv/dt = -gamma v; for a drive by white noise drive_strength, m^2/s^3, of
             dT/dt = drive_strength.
@@ -229,8 +235,24 @@ def elements_of_header(header: dict[str, str]) -> dict[str, Any]:
                 + (fitted if missing[0] in GUESSES else "")
             )
         values = header | {key: GUESSES[key] for key in GUESSES if header.get(key) == GUESS}
-        elements[name] = kind(**{fields[key]: files.header_number(values, key) for key in given})
+        elements[name] = kind(
+            **{
+                fields[key]: header_sides(values)
+                if key == "container_side"
+                else files.header_number(values, key)
+                for key in given
+            }
+        )
     return elements
+
+
+def header_sides(header: dict[str, str]) -> float | list[float]:
+    """Return the side of a cubic or square container, or its d sides, m."""
+    sides = [
+        files.header_number({"container_side": part.strip()}, "container_side")
+        for part in header["container_side"].split("x")
+    ]
+    return sides if len(sides) > 1 else sides[0]
 
 
 def priors_of_header(header: dict[str, str]) -> dict[str, tuple[float, float]]:

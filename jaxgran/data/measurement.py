@@ -132,12 +132,13 @@ class Measurement(eqx.Module):
             raise ValueError(f"gas must be a jaxgran.Gas, got {type(gas).__name__}")
         gas.check_single()
         if isinstance(data, CoolingCurve):
-            data.check()
+            data.check_measured()
             _check_magnitudes(data)
         elif not isinstance(data, DropTest):
             raise ValueError(
-                f"data must be a jaxgran.CoolingCurve or a jaxgran.DropTest, got {data!r:.60}. "
-                "Make a curve of arrays by jaxgran.CoolingCurve(t, T)"
+                f"data must be a jaxgran.CoolingCurve or a jaxgran.DropTest, got "
+                f"{type(data).__name__}. Make a curve of arrays by jaxgran.CoolingCurve(t, T), of "
+                "a table of pandas by jaxgran.CoolingCurve.from_pandas(table)"
             )
         if num_particles is not None:
             num_particles = checked_int("num_particles", num_particles, 1)

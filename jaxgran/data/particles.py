@@ -59,6 +59,7 @@ XYZ_VECTORS = {
     "velo": VELOCITY,
     "vel": VELOCITY,
     "velocities": VELOCITY,
+    "velocity": VELOCITY,
     "angular_velocity": SPIN,
 }
 """Names of the columns of properties of an extended XYZ file."""
@@ -355,6 +356,7 @@ def _read_xyz(lines: list[str], dimension: int | None) -> Frame:
     parts = info["properties"].split(":")
     names: list[str] = []
     for name, number in zip(parts[::3], map(int, parts[2::3]), strict=True):
+        name = name.lower() if name.lower() in XYZ_VECTORS else name
         several = XYZ_VECTORS.get(name, [f"{name}_{k}" for k in range(number)])
         # In a plane the only component of the angular velocity is that of z.
         names += [name] if number == 1 and name not in XYZ_VECTORS else several[-number:]

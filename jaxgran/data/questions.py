@@ -12,9 +12,12 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxgran.data import files
-from jaxgran.data.curve import QUANTITIES, CoolingCurve
+from jaxgran.data.curve import MIN_POINTS, QUANTITIES, CoolingCurve, above_noise
+from jaxgran.data.definitions import Scene, other_definitions
+from jaxgran.data.drop_test import DropTest
 from jaxgran.data.tables import UNITS, unit_in
 from jaxgran.scene.gas import Gas
+from jaxgran.scene.geometry import sphere_mass
 from jaxgran.scene.parameters import REQUIRED
 
 USUAL_RANGES = {
@@ -31,12 +34,14 @@ USUAL_RANGES = {
     "T": (0.0, 900.0),
     "msd": (0.0, 1e4),
     "T_rot": (0.0, 900.0),
+    "v": (0.0, 8.0),  # a drop from 3 m
 }
 """Smallest and largest usual value of header keys and columns in granular gases."""
 
 OTHER_UNITS = {
     "m": ("mm", "cm", "um"),
     "m^2": ("mm^2", "cm^2", "um^2"),
+    "m/s": ("cm/s", "mm/s"),
     "s": ("ms", "us", "min"),
     "1/s": ("1/ms", "1/min"),
     "m^2/s^2": ("mm^2/s^2", "cm^2/s^2"),
@@ -45,8 +50,6 @@ OTHER_UNITS = {
     "Pa": ("GPa", "MPa", "kPa"),
 }
 """Units in which values are often given, by SI unit."""
-
-BOLTZMANN = 1.380649e-23
 
 MAX_RATIO = 1.3
 """Ratio of T at t = 0 to T0, or of T0 to it, above which a question is asked."""
@@ -72,7 +75,12 @@ def ask_about_header(values: dict[str, float]) -> Iterator[str]:
         if not _is_usual(key, value):
             yield _unit_question(key, value, f"{key}: ")
         error = values.get(f"{key}_err", 0.0)
-        if key in USUAL_RANGES and error > value > 0:
+        if key == "T0" and value == 1:
+            yield (
+                "T0 is 1 m^2/s^2: is the temperature divided by its first value? Then give T0 in "
+                "m^2/s^2, and multiply T by it"
+            )
+        if key != "t0" and error > value > 0:
             yield (
                 f"{key}_err is {error:.6g} {UNITS[key]}, more than {key}, {value:.6g}: a number "
                 f"without a unit has that of {key}. Is it in {UNITS[key]}? Then write it behind"
@@ -83,6 +91,8 @@ def _unit_question(name: str, value: float, line: str) -> str:
     low, high = USUAL_RANGES[name]
     base = UNITS[name]
     question = "check its unit"
+    if base == "m^2/s^2":
+        question += " (kelvin times 1.38e-23 J/K over the mass are m^2/s^2)"
     for unit in OTHER_UNITS[base]:
         in_si = unit_in(unit, base) * value
         if _is_usual(name, in_si):
@@ -93,11 +103,34 @@ def _unit_question(name: str, value: float, line: str) -> str:
     return f"{name} is {value:.6g} {base}, and usual is {low:g} to {high:g}: {question}"
 
 
+def ask_about_speeds(test: DropTest) -> Iterator[str]:
+    """Yield questions about unusual speeds of a drop test."""
+    largest = float(np.max(np.asarray(test.speed)))
+    if not _is_usual("v", largest):
+        yield _unit_question("v", largest, "")
+
+
+def scene_of(header: dict[str, str]) -> Scene:
+    """Return what the factors of definitions of T depend on."""
+    known = {"diameter", "density"} <= header.keys()
+    size, density = (files.header_number(header, k) if known else np.nan for k in _SIZE)
+    return Scene(
+        d=files.header_count(header, "dimension") or 3,
+        mass=float(sphere_mass(size, density)) if known else np.nan,
+        number=files.header_count(header, "N") or np.nan,
+        T0=files.header_number({"T0": "0"} | header, "T0") or np.nan,
+    )
+
+
+_SIZE = ("diameter", "density")
+
+
 def ask_about_columns(
     curve: CoolingCurve,
     header: dict[str, str],
     gas: Gas | None,
-    rounding: dict[str, np.ndarray],
+    rounding: dict[str, np.ndarray] | None = None,
+    column: str = "T",
 ) -> Iterator[str]:
     """Yield questions about unusual values of columns, and columns that contradict the header.
 
@@ -106,8 +139,15 @@ def ask_about_columns(
         header: in SI.
         gas: of the header, if it describes one.
         rounding: last digits as they were written, by field.
+        column: from which T was read.
     """
-    yield from _ask_about_digits(curve, rounding)
+    if column == "mean_speed" and scene_of(header).d == 3:
+        yield (
+            "mean_speed is taken for that of all three components. If it is of the two that one "
+            "camera sees, T is .62 times too small and A 37 % too large: name the column "
+            "mean_speed_xy then, and mean_speed_xyz otherwise"
+        )
+    yield from _ask_about_digits(curve, rounding or {})
     for quantity in QUANTITIES.values():
         values = getattr(curve, quantity.field)
         if quantity.measured and values is not None and not quantity.column.endswith("_err"):
@@ -119,10 +159,11 @@ def ask_about_columns(
     if not all(_is_usual(key, float(header[key])) for key in REQUIRED if key in header):
         return  # `ask_about_header` asks first
     number = files.header_count(header, "N")
-    yield from _ask_about_start(curve, header, gas, number)
+    yield from _ask_about_start(curve, header, gas, number, column)
     if number is not None and curve.temperature_error is not None:
         replicas = files.header_count(header, "replicas") or 1
-        share = np.asarray(curve.temperature_error) / np.asarray(curve.temperature)
+        rows = above_noise(curve)
+        share = np.asarray(curve.temperature_error)[rows] / np.asarray(curve.temperature)[rows]
         expected = sqrt(2 / (gas.dimension * number * replicas))
         ratios = {"larger": share[1:].min() / expected, "smaller": expected / share.max()}
         for word, ratio in ratios.items():
@@ -152,12 +193,15 @@ def _ask_about_digits(curve: CoolingCurve, rounding: dict[str, np.ndarray]) -> I
 
 
 def _ask_about_start(
-    curve: CoolingCurve, header: dict[str, str], gas: Gas, number: int | None
+    curve: CoolingCurve, header: dict[str, str], gas: Gas, number: int | None, column: str
 ) -> Iterator[str]:
     """Compare T at first with T0, the clock with T0, and the loss with the mean free time."""
     header = {"t0": "0", "T0_err": "0"} | header
-    times = np.asarray(curve.times) - files.header_number(header, "t0")
-    T, T0 = np.asarray(curve.temperature), float(gas.temperature)
+    positive = above_noise(curve)
+    times = np.asarray(curve.times)[positive] - files.header_number(header, "t0")
+    T, T0 = np.asarray(curve.temperature)[positive], float(gas.temperature)
+    if len(T) < MIN_POINTS:
+        return
     rows = slice(0, max(4, int(np.sum(0.4 * T[0] < T))))
     line = (T[rows] / T0) ** -0.6  # straight in time for viscoelastic spheres
     slope, origin = np.polyfit(times[rows] - times[0], line, 1, w=1 / line)
@@ -170,15 +214,15 @@ def _ask_about_start(
     known = 3 * files.header_number(header, "T0_err") / T0
     at_zero = max(origin - slope * times[0], 1e-9) ** (-1 / 0.6)
     if first > MAX_RATIO + chance + known:
-        yield _scale_question(first, gas, number)
+        yield _scale_question(first, gas, header, column)
     elif begin > MAX_LATENESS * halving and begin > 0.5 * times[0]:
         yield (
             f"T is T0 = {T0:g} m^2/s^2 at t = {begin:.6g} s and not at 0, by the first rows: does "
             "the clock of the file start earlier than the gas? Then subtract that time, or fit it: "
-            "--free A t0. Or is T0 another one? Then --free A T0"
+            "--free A t0"
         )
     elif at_zero < 1 / (MAX_RATIO + chance + known):
-        yield _scale_question(at_zero, gas, number)
+        yield _scale_question(at_zero, gas, header, column)
     loss = gas.dimension * slope / (0.6 * origin) / float(_collision_frequency(gas))
     if T[-1] < 0.8 * T[0] and not USUAL_LOSS[0] <= loss <= USUAL_LOSS[1]:
         units = [unit for unit in OTHER_UNITS["s"] if 1e-3 < loss / unit_in(unit, "s") < 1]
@@ -198,27 +242,24 @@ def _collision_frequency(gas: Gas) -> Array:
     return gas.collision_frequency
 
 
-def _scale_question(ratio: float, gas: Gas, number: int | None) -> str:
-    """Return the question for T that begins at another value than T0."""
-    d, mass, T0 = gas.dimension, float(gas.mass), float(gas.temperature)
-    meanings = [
-        (d, "<v^2>, not divided by the dimension"),
-        (2, "<v_x^2 + v_y^2>? Then name the column v2_xy. Is it twice T"),
-        (1 / T0, "T over T0"),
-        (d / 2, "the energy over the mass"),
-        (mass, "m <v^2>/d, in J"),
-        (d * mass / 2, "the energy of a particle, in J? Then name the column energy. Is it that"),
-        (d * mass / 2 * (number or np.nan), "the energy of all particles, in J"),
-        (mass / BOLTZMANN, "in kelvin, m <v^2>/(d k_B)"),
-        (1e4, "in cm^2/s^2"),
-        (1e6, "in mm^2/s^2"),
-    ]
-    near = [(f, words) for f, words in meanings if abs(np.log(ratio / f)) < 0.12]
-    question = "do both have the unit m^2/s^2, and are both <v^2>/d?"
-    if near:
-        factor, words = near[0]
-        question = f"is the column {words}? Then multiply it by {1 / factor:.6g}"
+def _scale_question(ratio: float, gas: Gas, header: dict[str, str], column: str) -> str:
+    """Return the question for T that begins at another value than T0.
+
+    T0 is not offered for a fit: a fit would take the wrong scale for a hotter or colder gas.
+    """
+    T0 = float(gas.temperature)
+    causes = []
+    for definition, factor in other_definitions(ratio, column, scene_of(header)):
+        name = f"name the column {definition.column}, or " if definition.column else ""
+        causes.append(
+            f"is the column {definition.words}? Then {name}multiply "
+            + (f"it by {factor:.6g}" if definition.power == 1 else f"T by {factor:.6g}")
+        )
+    question = ". Or ".join(causes) or (
+        "are both <v^2>/d of one grain, in m^2/s^2? (Neither kelvin, nor the energy of all N "
+        "grains, nor T over its first value)"
+    )
     return (
         f"T is {ratio * T0:.4g} at first, {ratio:.3g} times the header's T0 = {T0:g} m^2/s^2: "
-        f"{question}; or correct T0, or fit it: --free A T0"
+        f"{question}. If T is right, correct T0"
     )

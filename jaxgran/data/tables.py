@@ -24,28 +24,46 @@ from jaxgran.scene.parameters import BY_SYMBOL
 UNIT_KEYS = {"length_unit": "m", "time_unit": "s", "speed_unit": "m/s"}
 """Header keys of units, and the units that they replace. speed_unit is also that of T, squared."""
 
-UNITS = {
+HEADER_UNITS = {
     **UNIT_KEYS,
-    **{quantity.column: quantity.unit for quantity in QUANTITIES.values()},
     **{symbol: parameter.unit or "1" for symbol, parameter in BY_SYMBOL.items()},
-    **dict.fromkeys(("x", "y", "z", "localisation_error", "box_side"), "m"),
-    **dict.fromkeys(("mean_speed", "v"), "m/s"),
-    **dict.fromkeys(("vx2", "v2_xy"), "m^2/s^2"),
-    "energy": "J",
+    **dict.fromkeys(("localisation_error", "box_side"), "m"),
     "frame_rate": "1/s",
     "timestep": "s",
+    "T_scale": "1",
+}
+"""Unit of each header key; that of a standard error, x_err, is that of x."""
+
+COLUMN_UNITS = {
+    **{quantity.column: quantity.unit for quantity in QUANTITIES.values()},
+    **dict.fromkeys(("x", "y", "z"), "m"),
+    **dict.fromkeys(("mean_speed", "mean_speed_xyz", "mean_speed_xy", "mean_speed_x", "v"), "m/s"),
+    **dict.fromkeys(("vx2", "v2_xy", "v2"), "m^2/s^2"),
+    **dict.fromkeys(("energy", "total_energy"), "J"),
     "eps": "1",
 }
-"""Unit of each column and header key; that of a standard error, x_err, is that of x."""
+"""Unit of each column; that of a standard error, x_err, is that of x."""
+
+UNITS = HEADER_UNITS | COLUMN_UNITS
+
+HEADER_ALIASES = {"phi": "eta", "packing_fraction": "eta"}
+"""Further names of header keys."""
+
+COMMENT_SIGNS = "#%"
 
 ALIASES = {
     "time": "t",
     **{quantity.field: quantity.column for quantity in QUANTITIES.values()},
-    **{name: name for name in ("id", "particle", "frame", "x", "y", "z")},
+    **{name: name for name in ("id", "particle", "track_id", "frame", "x", "y", "z")},
+    **{f"position_{name}": name for name in "xyzt"},
+    **dict.fromkeys(("total_energy", "trakineticenergy", "ene_kin", "kineng"), "total_energy"),
 }
 """Further names of columns, in any case."""
 
 SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas", "|": "bars", " ": "blanks"}
+
+MAX_UNIT = 60
+"""Largest number of characters of a unit."""
 
 _MARKS = {
     "utf-32": (codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE),
@@ -54,7 +72,14 @@ _MARKS = {
 _BINARY = re.compile(r"[\x00-\x08\x0e-\x1f]")
 _NAME = re.compile(r"(?P<name>\w+)\s*(?:[(\[](?P<bracket>.*)[)\]]|/\s*(?P<slash>.+))?")
 _NAMES_BETWEEN_BLANKS = re.compile(r"[^\s(\[]+(?:\s*[(\[][^)\]]*[)\]])?")
-_NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)([eEdD][+-]?\d+)?")
+_DIGITS = r"[+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eEdD][+-]?\d+)?"
+_NUMBER = re.compile(_DIGITS)
+_NUMBER_AND_UNIT = re.compile(rf"({_DIGITS})\s*(.*)")
+_SIDES = re.compile(rf"{_DIGITS}(?:\s*[x×]\s*{_DIGITS})+")
+_PLUS_MINUS = re.compile(r"\s*(?:±|\+/?-)\s*")
+_BRACKETED = re.compile(r"\(([^()]*)\)(.*)")
+_DIGITS_IN_BRACKETS = re.compile(r"([+-]?\d*[.,]?\d*)\s*\((\d+)\)((?:[eEdD][+-]?\d+)?)(.*)")
+_POWER = re.compile(r"\^(?:-?\d|\(-?\d\))(?![\d.^])")
 
 
 class Table(NamedTuple):
@@ -141,18 +166,24 @@ def read_table(
     text = read_text(path, wanted).replace("\r\n", "\n").replace("\r", "\n")
     for i, line in enumerate(text.split("\n"), start=1):
         bare = line.strip(' "\t,;|')
-        if bare.startswith("#"):
-            _add_header_line(header, i, bare.strip("# "))
+        if bare[:1] and bare[0] in COMMENT_SIGNS:
+            _add_header_line(header, i, bare.lstrip(COMMENT_SIGNS + " ").rstrip("# "))
         elif bare and not names:
+            if not re.match(r"[\w\"'.+-]", bare):
+                raise ValueError(
+                    f"line {i} begins with {bare[0]!r}: header lines and comments begin with # or %"
+                )
             separator = next((mark for mark in SEPARATORS if mark in line), " ")
             first, names = i, _names(i, line, separator, wanted)
         elif bare:
             rows[i] = _split(line, separator, len(names))
     if not names:
         raise ValueError(f"line {i}: the file ends without columns; it needs {wanted}")
-    header |= given
+    header |= _with_usual_keys(given)
     units = _pop_units(header)
+    units_of_rows = _pop_head_rows(rows, names)
     told = [_name_and_unit(name) for name in names]
+    told = [(name, unit or units_of_rows.get(k, "")) for k, (name, unit) in enumerate(told)]
     bare_names = [name for name, _ in told]
     try:
         chosen = list(columns_to_read([name for name in bare_names if name]))
@@ -168,16 +199,22 @@ def read_table(
         )
         if not all(map(math.isfinite, values[-1])):
             advice = "correct or remove this row"
+            if any(_PLUS_MINUS.search(cell) or _DIGITS_IN_BRACKETS.fullmatch(cell) for cell in row):
+                advice = f"write errors into a column of their own, such as {names[-1]}_err"
             if len(row) > len(names) and separator == ",":
                 advice += "; if numbers have decimal commas, separate the columns by semicolons"
             raise ValueError(
                 f"line {i}: expected {len(names)} finite numbers ({','.join(names)}) between "
                 f"{SEPARATORS[separator]}, got {separator.join(row)!r}; {advice}"
             )
-    columns = np.reshape(values, (len(rows), len(at))).T * np.array([[factors[k]] for k in at])
+    numbers = np.reshape(values, (len(rows), len(at))).T * np.array([[factors[k]] for k in at])
+    columns = dict(zip(chosen, numbers, strict=True))
+    for name in chosen:
+        if _is_relative(name, dict(told)):
+            columns[name] = columns[name] * np.abs(columns[name.removesuffix("_err")])
     return Table(
         _convert_header(header, units, comma),
-        dict(zip(chosen, columns, strict=True)),
+        columns,
         list(rows),
         {name: [row[k] for row in rows.values()] for name, k in zip(chosen, at, strict=True)},
         {name: factors[k] for name, k in zip(chosen, at, strict=True)},
@@ -200,7 +237,10 @@ def _split(line: str, separator: str, length: int) -> list[str]:
     """Return the cells of a line, without empty ones beyond a length, as spreadsheets add them."""
     cells = line.split()
     if separator != " ":
-        (cells,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
+        try:
+            (cells,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
+        except csv.Error as error:
+            raise ValueError(f"a line that begins {line[:20]!r}: {error}") from None
     cells = [cell.strip(' \t"') for cell in cells]
     while len(cells) > length and not cells[-1]:
         cells.pop()
@@ -234,6 +274,31 @@ def _decimal_comma(rows: dict[int, list[str]], at: list[int], separator: str) ->
     return comma is not None
 
 
+def _pop_head_rows(rows: dict[int, list[str]], names: list[str]) -> dict[int, str]:
+    """Remove rows of words below the names; return units in brackets, by the place of the column.
+
+    Such rows are those of units, and further names above a row of units, as TrackMate writes them.
+    """
+    head = []
+    for i, row in rows.items():
+        if any(_NUMBER.fullmatch(cell) for cell in row):
+            break
+        head.append(i)
+    found = [(i, _units_in_brackets(rows[i])) for i in head]
+    last = max((i for i, units in found if units), default=0)
+    for i in head:
+        if i <= last:
+            rows.pop(i)
+    return dict(found).get(last, {})
+
+
+def _units_in_brackets(row: list[str]) -> dict[int, str]:
+    cells = {k: cell for k, cell in enumerate(row) if cell}
+    if not cells or not all(cell[0] + cell[-1] in ("()", "[]") for cell in cells.values()):
+        return {}
+    return {k: cell[1:-1] for k, cell in cells.items()}
+
+
 def _plain_number(text: str, comma: bool) -> str:
     """Return a number with a decimal point and the exponent e; other text unchanged."""
     if not _NUMBER.fullmatch(text) or ("," in text and not comma):
@@ -257,7 +322,7 @@ def header_entry(line: str) -> tuple[str, str] | None:
         return None
     key, mark, value = (part.strip() for part in match.groups())
     name = _NAME.fullmatch(key)
-    if name is not None and _base_unit(name["name"]) is not None:
+    if name is not None and _base_unit(name["name"], HEADER_UNITS) is not None:
         unit = name["bracket"] or name["slash"]
         return name["name"], f"{value} {unit}" if unit else value
     return None if mark == "=" and name is None else (key, value)
@@ -266,6 +331,7 @@ def header_entry(line: str) -> tuple[str, str] | None:
 def _add_header_line(header: dict[str, str], i: int, line: str) -> None:
     """Add a line that is an entry; skip other comments, and sentences that begin alike."""
     key, value = header_entry(line) or ("", "")
+    key = HEADER_ALIASES.get(key, key)
     if key and key not in header:
         header[key] = value
     elif key and _NAME.fullmatch(key):
@@ -274,18 +340,23 @@ def _add_header_line(header: dict[str, str], i: int, line: str) -> None:
         )
 
 
-def _base_unit(name: str) -> str | None:
+def _with_usual_keys(header: dict[str, str]) -> dict[str, str]:
+    return {HEADER_ALIASES.get(key, key): value for key, value in header.items()}
+
+
+def _base_unit(name: str, units: dict[str, str] = UNITS) -> str | None:
     """Return the SI unit of a column or header key, also of a standard error; None if unknown."""
-    return UNITS.get(name.removesuffix("_err"))
+    return units.get(name.removesuffix("_err"))
 
 
 def _pop_units(header: dict[str, str]) -> dict[str, str]:
     """Remove the header keys of units; return the unit of numbers without one, by its SI unit."""
+    speed_given = "speed_unit" in header
     told = {key: header.pop(key, unit) for key, unit in UNIT_KEYS.items()}
     for key in told:
         _factor(key, told, {}, "header line")
     length, time, speed = told.values()
-    if speed == UNIT_KEYS["speed_unit"]:
+    if not speed_given:
         speed = f"{length}/{time}"
     return {
         "m": length,
@@ -313,21 +384,92 @@ def header_in_si(header: dict[str, str]) -> dict[str, str]:
     >>> header_in_si({"diameter": "2 mm", "eta": "0.05"})
     {'diameter': '0.002', 'eta': '0.05'}
     """
-    header = dict(header)
+    header = _with_usual_keys(header)
     return _convert_header(header, _pop_units(header), comma=False)
 
 
 def _convert_header(header: dict[str, str], units: dict[str, str], comma: bool) -> dict[str, str]:
-    parts = {key: text.partition(" ") for key, text in header.items()}
-    told = {key: unit.strip() for key, (_, _, unit) in parts.items()}
+    header = _with_own_errors(header)
+    parts: dict[str, tuple[str, str]] = {}
+    for key, text in header.items():
+        match = (_SIDES if key == "container_side" else _NUMBER).match(text)
+        if match is not None:
+            parts[key] = match[0], text[match.end() :].strip()
+    told = {key: unit for key, (_, unit) in parts.items()}
     converted = dict(header)
-    for key, (number, _, unit) in parts.items():
-        number = _plain_number(number, comma)
-        is_number = _NUMBER.fullmatch(number) and "," not in number
-        if is_number and (_base_unit(key) is not None or not unit):
-            factor = _factor(key, told, units, "header line")
-            converted[key] = number if factor == 1 else repr(factor * float(number))
+    for key, (text, unit) in parts.items():
+        if unit and _base_unit(key, HEADER_UNITS) is None:
+            continue
+        numbers = [_plain_number(part.strip(), comma) for part in re.split("[x×]", text)]
+        if any("," in number for number in numbers):
+            continue
+        factor = _factor(key, told, units, "header line")
+        if factor != 1:
+            numbers = [repr(factor * float(number)) for number in numbers]
+        converted[key] = " x ".join(numbers)
+    for key in parts:
+        value = converted.get(key.removesuffix("_err"), "1")
+        if _is_relative(key, told) and _NUMBER.fullmatch(value):
+            converted[key] = repr(float(converted[key]) * abs(float(value)))
     return converted
+
+
+def _with_own_errors(header: dict[str, str]) -> dict[str, str]:
+    """Return a header in which errors that stand behind values have keys of their own."""
+    split = dict(header)
+    for key, text in header.items():
+        if _base_unit(key, HEADER_UNITS) is None:
+            continue
+        value, error = _value_and_error(text)
+        if error and f"{key}_err" in header:
+            raise ValueError(f"header line {key}: {text!r} gives {key}_err again; remove one")
+        if error:
+            split |= {key: value, f"{key}_err": error}
+    return split
+
+
+def _value_and_error(text: str) -> tuple[str, str]:
+    """Return a value and its error, "" if it has none, of "3.00 ± 0.05 mm" or "3.00(5) mm".
+
+    >>> from jaxgran.data.tables import _value_and_error
+    >>> _value_and_error("3.00(5) mm"), _value_and_error("0.04 +- 5 %")
+    (('3.00 mm', '0.05 mm'), ('0.04', '5 %'))
+    """
+    if digits := _DIGITS_IN_BRACKETS.fullmatch(text):
+        number, error, exponent, unit = digits.groups()
+        decimals = len(re.split("[.,]", number)[1]) if re.search("[.,]", number) else 0
+        error = f"{int(error) * 10.0**-decimals:.{decimals}f}"
+        return f"{number}{exponent}{unit}", f"{error}{exponent}{unit}"
+    behind = ""
+    if (bracketed := _BRACKETED.fullmatch(text)) and _PLUS_MINUS.search(bracketed[1]):
+        text, behind = bracketed[1].strip(), f" {bracketed[2].strip()}"
+    parts = _PLUS_MINUS.split(text)
+    numbers = [_NUMBER_AND_UNIT.fullmatch(part) for part in parts]
+    if len(parts) != 2 or not all(numbers):
+        return text, ""
+    (value, unit), (error, unit_of_error) = (m.groups() for m in numbers if m)
+    if not behind and not _is_dimensionless(unit_of_error):
+        unit = unit or unit_of_error
+    unit = unit or behind
+    return f"{value} {unit}".strip(), f"{error} {unit_of_error or unit}".strip()
+
+
+def _is_dimensionless(unit: str) -> bool:
+    """Return whether a text is a unit without a dimension, such as %."""
+    try:
+        return bool(unit) and unit != "1" and unit_in(unit, "1") != 1
+    except Exception:  # see `_factor`
+        return False
+
+
+def _is_relative(name: str, told: dict[str, str]) -> bool:
+    """Return whether a standard error is a part of its value, as one in % is.
+
+    It is not if the value has the same unit.
+    """
+    unit = told.get(name, "")
+    value = told.get(name.removesuffix("_err"), "")
+    return name.endswith("_err") and unit != value and _is_dimensionless(unit)
 
 
 def _name_and_unit(name: str) -> tuple[str, str]:
@@ -355,6 +497,8 @@ def _factor(name: str, told: dict[str, str], units: dict[str, str], kind: str) -
     if base is None:
         return 1.0
     unit = told[name] or told.get(name.removesuffix("_err")) or units.get(base, base)
+    if _is_relative(name, told):
+        return unit_in(unit, "1")
     if unit in (base, base.replace("m^2/s^2", "(m/s)^2")):
         return 1.0
     try:
@@ -362,7 +506,7 @@ def _factor(name: str, told: dict[str, str], units: dict[str, str], kind: str) -
     except Exception:  # pint raises errors of many types for text that is no unit
         advice = f"write a unit such as {base}, or leave it out"
         if base == "m^2/s^2":
-            advice = "T is <v^2>/d, in m^2/s^2: convert it, or leave the unit out"
+            advice = "T is <v^2>/d, in m^2/s^2: multiply kelvin by 1.38e-23 J/K over the mass"
         raise ValueError(
             f"{kind} {name}: {unit!r} is not known as a unit of {base}; {advice}"
         ) from None
@@ -375,7 +519,10 @@ def unit_in(unit: str, base: str) -> float:
     >>> unit_in("g/cm^3", "kg/m^3")
     1000.0
     """
-    parsed = _units().parse_units(re.sub(r"([A-Za-z])(\d)", r"\1^\2", unit))
+    text = re.sub(r"([A-Za-z])(\d)", r"\1^\2", unit.replace("**", "^"))
+    if len(text) > MAX_UNIT or "^" in _POWER.sub("", text):
+        raise ValueError("units have powers of one digit")
+    parsed = _units().parse_units(text)
     if "pixel" in str(parsed):  # which pint takes for 1/96 inch
         raise ValueError("a pixel is no length")
     factor = _units().Quantity(1.0, parsed).to("" if base == "1" else base).magnitude

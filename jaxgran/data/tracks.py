@@ -10,16 +10,16 @@ import numpy as np
 import scipy  # which imports scipy.stats at its first use
 from jaxtyping import Float, Int
 
-from jaxgran.data.curve import MIN_POINTS, CoolingCurve
+from jaxgran.data.curve import MIN_POINTS, CoolingCurve, check_values
 from jaxgran.data.files import header_count, header_number
 from jaxgran.data.particles import Frame, open_frames
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass
 
 COORDINATES = ("x", "y", "z")
-IDENTITIES = ("id", "particle")
+IDENTITIES = ("track_id", "id", "particle")
 CLOCKS = ("t", "frame")
-"""Columns of tracks, the first of which that a file has is read; the second names are trackpy's."""
+"""Names of columns of tracks, in order of preference; some are those of TrackMate and trackpy."""
 
 TRACK_KEYS = ("box_side", "frame_rate", "timestep", "localisation_error")
 """Header keys of tracks and trajectories."""
@@ -106,6 +106,9 @@ def is_trajectory(path: Path) -> bool:
     if Path(str(path).removesuffix(".gz")).suffix in TRAJECTORIES:
         return True
     try:
+        # Not of a pipe, which can be read only once.
+        if not path.is_file():
+            return False
         with path.open("rb") as file:
             return file.read(5) == b"ITEM:"
     except OSError:
@@ -123,7 +126,8 @@ def track_columns(names: list[str]) -> list[str]:
     if None in chosen or coordinates[:2] != ["x", "y"]:
         raise ValueError(
             f"the columns are {', '.join(names)}; tracks of particles have id,t,x,y and, where "
-            "measured, z (or particle and frame, as trackpy names them)"
+            "measured, z (or particle and frame, as trackpy names them; or TRACK_ID, "
+            "POSITION_X, ..., as TrackMate does)"
         )
     return [*map(str, chosen), *coordinates]
 
@@ -177,7 +181,7 @@ def curve_of_tracks(
     steps, notes, questions = _steps(columns, header, lines), [], []
     usable = [step for step in steps if len(step.ids) >= MIN_TRACKS]
     if len(usable) < MIN_POINTS:
-        number = len(np.unique(columns["id" if "id" in columns else "particle"]))
+        number = len(np.unique(_identities(columns)))
         raise ValueError(
             f"line {lines[-1] if lines else 1}: the file ends after tracks of {number} particle(s) "
             f"in {len(steps) + 1} frames; at least {MIN_TRACKS} particles in {MIN_POINTS + 1} "
@@ -229,23 +233,31 @@ def curve_of_tracks(
             true = T / _displacement_factor(rate * duration * np.sqrt(true))
         words = "impacts between frames take up to {} from T", "use frames closer together"
         note_correction("impacts between frames corrected", np.max(1 - T / true), *words)
-    curve = CoolingCurve(
-        times=jnp.asarray([step.time for step in usable]),
-        temperature=jnp.asarray(true),
-        temperature_error=jnp.asarray(error * true / T),
-    )
+    fields = {
+        "times": jnp.asarray([step.time for step in usable]),
+        "temperature": jnp.asarray(true),
+        "temperature_error": jnp.asarray(error * true / T),
+    }
+    check_values(fields, place="T between frames {} and the next".format)
+    curve = CoolingCurve(**fields)
     header["T_from"] = f"T = <(u - <u>)^2>/d, u over neighbouring frames; {'; '.join(notes)}"
-    curve.check("T between frames {} and the next".format)
     for key in ("box_side", "frame_rate"):
         header.pop(key, None)
     return curve, questions
 
 
+def _identities(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    return next(columns[name] for name in IDENTITIES if name in columns)
+
+
 def _steps(
     columns: Mapping[str, np.ndarray], header: dict[str, str], lines: list[int]
 ) -> list[Step]:
-    ids = columns["id" if "id" in columns else "particle"]
-    position = np.stack([columns[name] for name in COORDINATES if name in columns], axis=1)
+    ids = _identities(columns)
+    coordinates = [name for name in COORDINATES if name in columns]
+    if "z" in columns and np.ptp(columns["z"]) == 0:  # as TrackMate writes for pictures
+        coordinates.remove("z")
+    position = np.stack([columns[name] for name in coordinates], axis=1)
     if np.any(fractions := ids != np.round(ids)):
         i = int(np.argmax(fractions))
         raise ValueError(f"line {lines[i]}: id is {ids[i]:g}; number the particles")
@@ -521,8 +533,8 @@ def curve_of_trajectory(
     if not rows:
         raise ValueError("it has no frames")
     fields = {name: jnp.asarray([row[name] for row in rows if name in row]) for name in rows[0]}
-    curve = CoolingCurve(**fields)  # type: ignore[arg-type]
-    curve.check("frame {}".format)
+    check_values(fields, place="frame {}".format)
+    curve = CoolingCurve(**fields)
     if curve.times[0] == 0:
         header.setdefault("T0", repr(rows[0]["temperature"]))
     header["T_from"] = "T = <v^2>/d of the particles of each frame, in the frame at rest"

@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from jaxgran._utils import status
 from jaxgran._utils.tracing import as_jax_arrays
-from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.curve import CoolingCurve, above_noise
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.alternatives import Explanations, compare_alternatives
@@ -29,7 +29,7 @@ from jaxgran.fitting.outliers import without_outliers
 from jaxgran.fitting.parameters import as_floats, with_floats
 from jaxgran.fitting.problem import Evaluation, Problem
 from jaxgran.fitting.result import Fit
-from jaxgran.fitting.rows import SCATTER, CurveRows
+from jaxgran.fitting.rows import SCATTER, TINY, CurveRows
 from jaxgran.fitting.search import Descent, Minimum, best_of_starts, minimise
 from jaxgran.fitting.setup import Request, build_problem, problem_with_rate_errors
 from jaxgran.models.checks import describe_walls
@@ -47,15 +47,38 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
         best, minima = best_of_starts(problem, first, max_steps, descent)
     check_computed(problem, best)
     explanations = None
-    if best.converged and not request.quick:
+    distant = distant_curves(problem, problem.evaluate(best.flat))
+    if distant:
+        notes = [*notes, say("distant", ratio=MAX_DISTANCE)]
+    elif best.converged and not request.quick:
         is_driven = any(m.scene.drive is not None for m in problem.curves)
         noise = np.zeros(problem.num_free)
         explanations = compare_alternatives(problem, minima, noise, request.absent, is_driven)
     result = assembled(request, problem, best, minima, explanations)
     share = measurement_share(problem, problem.evaluate(best.flat))
-    if result.p_value < SIGNIFICANCE / 2 and not request.quick:
+    if result.p_value < SIGNIFICANCE / 2 and not request.quick and not distant:
         notes += _outlier_notes(problem, first, max_steps)
     return with_messages(request, result, explanations, notes, share)
+
+
+MAX_DISTANCE = 3.0
+"""Factor between measured and fitted T from which on, if all values differ by it, the scale of T or
+of time is wrong."""
+
+
+def distant_curves(problem: Problem, found: Evaluation) -> list[str]:
+    """Return the labels of curves that no fit and no alternative comes near.
+
+    All alternatives begin at the same T_0: values that are all far off are in another unit, and the
+    search for an alternative would not end.
+    """
+    labels = []
+    for m in problem.curves:
+        T = m.values[:, 0][m.used[:, 0] > 0]
+        computed = found.curves[m.label]["temperature"][m.used[:, 0] > 0]
+        if np.all(np.abs(np.log(np.maximum(T, TINY) / computed)) > np.log(MAX_DISTANCE)):
+            labels.append(m.label)
+    return labels
 
 
 def _outlier_notes(problem: Problem, first: np.ndarray, max_steps: int) -> Iterator[str]:
@@ -236,13 +259,15 @@ def _as_curve(m: CurveRows, computed: dict[str, Any]) -> CoolingCurve:
     if m.scene.container is not None:
         absent += ("displacement", "diffusion")
     fields = {name: x for name, x in computed.items() if name not in absent}
+    fields["status"] = np.zeros((), int)
     return CoolingCurve(times=m.curve.times, **as_jax_arrays(fields))
 
 
 def describe_gas(gas: Gas, m: CurveRows) -> dict[str, float]:
     """Return numbers that describe a fitted gas: see `Fit.scales`."""
     N = m.measurement.num_particles
-    numbers = _scales(gas, float(m.values[-1, 0]), N or 1)
+    coolest = float(m.values[above_noise(m.curve), 0][-1])
+    numbers = _scales(gas, coolest, N or 1)
     described = {name: float(x) for name, x in numbers.items()}
     return described if N is not None else described | {"side": float("nan")}
 
@@ -284,6 +309,8 @@ def with_messages(
         for limitation in request.model.limitations(gas, N):
             if limitation.words not in {known.words for known in limitations}:
                 limitations.append(limitation)
+        if gas.container is not None:
+            notes.append(say("gravity"))
         if N is not None and gas.container is None and "walls" not in request.absent:
             prefix = f"{label}: " if label else ""
             notes.append(f"{prefix}the box of {N} spheres {describe_walls(gas, N)}")

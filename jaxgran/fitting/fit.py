@@ -1,6 +1,7 @@
 """Fits of the parameters of a gas to one measurement, or to several together."""
 
 import warnings
+from itertools import permutations
 from typing import Any
 
 import jax
@@ -144,7 +145,7 @@ def fit(
         if unused := unused_rotation(m):
             warnings.warn(unused, stacklevel=2)
     shared = priors.get(SHARED, {})
-    _check_model(model, solver, (*names, *separate), shared, gas, [*curves])
+    _check_model(model, solver, (*names, *separate), shared, gas, curves)
     known = {name for some in priors.values() for name in some}
     if {START_TIME, "temperature"} <= {*names, *separate} - known:
         for label in curves if START_TIME in separate else [SHARED]:
@@ -204,7 +205,29 @@ def _by_label(measurement: Any) -> dict[str, Measurement]:
             raise ValueError(
                 f"{label!r} must be a jaxgran.Measurement, got {_kind(value)}. {HOW_TO_MEASURE}"
             )
+    _check_no_copies(measurement)
     return dict(measurement)
+
+
+def _check_no_copies(measurements: dict[str, Measurement]) -> None:
+    """Raise ValueError if all values of one measurement are among those of another one."""
+    rows = {label: _rows_of(m.data) for label, m in measurements.items()}
+    for a, b in permutations(rows, 2):
+        if rows[a] <= rows[b]:
+            raise ValueError(
+                f"{a!r} and {b!r} hold the same values: two fits of one measurement would count it "
+                "twice. Give each measurement once"
+            )
+
+
+def _rows_of(data: CoolingCurve | DropTest) -> set[tuple[str, ...]]:
+    """Return the measured values as texts of 6 digits, in which copies in other units agree."""
+    if isinstance(data, DropTest):
+        columns = (data.speed, data.restitution, data.error)
+    else:
+        columns = (data.times, data.temperature)
+    rows = zip(*(np.asarray(x).tolist() for x in columns), strict=True)
+    return {tuple(f"{x:.6g}" for x in row) for row in rows}
 
 
 HOW_TO_MEASURE = (
@@ -296,9 +319,14 @@ def _check_request(
 
 
 def _check_model(
-    model: Any, solver: Any, names: tuple[str, ...], priors: Priors, gas: Gas, curves: list[str]
+    model: Any,
+    solver: Any,
+    names: tuple[str, ...],
+    priors: Priors,
+    gas: Gas,
+    curves: dict[str, Measurement],
 ) -> None:
-    """Raise ValueError unless a solver can fit a model to measurements; `curves` are labels."""
+    """Raise ValueError unless a solver can fit a model to measurements."""
     if not (solver is None or is_transformation(solver)):
         raise ValueError(
             "solver must be a gradient transformation of optax, such as optax.adam(0.05), or left "
@@ -310,10 +338,15 @@ def _check_model(
     if needs_start_time and not curves:
         raise ValueError(f"{START_TIME} needs a cooling curve, and there are drop tests alone")
     if model.stochastic:
-        if curves != [""]:
+        if [*curves] != [""]:
             raise ValueError(
                 "several measurements and drop tests are fitted by a model without noise, got "
                 f"{name}. Use jaxgran.KineticTheory(), or fit the curves one by one"
+            )
+        if not np.all(np.asarray(curves[""].curve.temperature) > 0):
+            raise ValueError(
+                f"T below 0 is compared by kinetic theory only, got {name}. Fit the curve up to "
+                "where T falls below some T_err"
             )
         if needs_start_time:
             raise ValueError(

@@ -11,7 +11,7 @@ import scipy
 from jaxtyping import Array, Float
 
 from jaxgran._utils.validation import POSITIVE
-from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.curve import CoolingCurve, above_noise
 from jaxgran.fitting.parameters import as_floats, residuals_and_slopes, with_floats
 from jaxgran.fitting.result import Fit
 from jaxgran.scene.gas import Gas, law_fields
@@ -103,7 +103,8 @@ def visited_speeds(result: Fit) -> tuple[float, float]:
     the 95 % quantile at the highest, with the fitted law.
     """
     data = [m.data for m in result.measurements.values()]
-    parts = [np.asarray(x.temperature) for x in data if isinstance(x, CoolingCurve)]
+    curves = [x for x in data if isinstance(x, CoolingCurve)]
+    parts = [np.asarray(x.temperature)[above_noise(x)] for x in curves]
     if not parts:
         raise ValueError("drop tests alone have no T: give a cooling curve, too")
     T = np.concatenate(parts)

@@ -55,6 +55,9 @@ Measured: 60 of 250 spheres, eps = .9, 400 replicas: correlations .75, .56, .42,
 LOG_FROM, LINEAR_TO = 10.0, 5.0
 """T over its error above which ln T is compared, and below which T itself is."""
 
+LOG_RATIO_FROM = 0.5
+"""Measured over computed value below which ln is continued by its tangent."""
+
 STEPS_OF_KNOWN_N = np.linspace(-3.0, 3.0, 7)
 """Values of the logarithm of N over which a likelihood is integrated, in standard errors of its
 prior."""
@@ -98,15 +101,38 @@ def log_ratio(values: Array, log_computed: Array, errors: Array) -> Array:
     both, so that it is continuous. The choice is by the computed value alone: one by the measured
     value would favour large ones.
     """
-    computed = jnp.exp(log_computed)
-    ratio = values / computed
+    ratio = values / jnp.exp(log_computed)
     # Continued to small and negative ratios by its tangent.
-    low = 0.5
-    log = jnp.where(ratio > low, jnp.log(jnp.maximum(ratio, low)), jnp.log(low) + ratio / low - 1)
-    distance = computed / jnp.where(errors > 0, errors, jnp.finfo(errors.dtype).tiny)
-    share = jnp.clip((distance - LINEAR_TO) / (LOG_FROM - LINEAR_TO), 0.0, 1.0)
-    share = share**2 * (3 - 2 * share)
+    above = ratio > LOG_RATIO_FROM
+    tangent = jnp.log(LOG_RATIO_FROM) + ratio / LOG_RATIO_FROM - 1
+    log = jnp.where(above, jnp.log(jnp.maximum(ratio, LOG_RATIO_FROM)), tangent)
+    share = _share_of_log(log_computed, errors)
     return jnp.where(share < 1, share * log + (1 - share) * (ratio - 1), log)
+
+
+def log_density_change(values: Any, log_computed: Any, errors: Any) -> Any:
+    """Return what -2 ln L gains as `log_ratio` is not everywhere ln of the measured value.
+
+    It is ``-2 ln(y df/dy)`` for the residual f of a value y, 0 where f is ln y: the density of y is
+    that of f times df/dy. Where y is below its error, the error replaces the first y, which no
+    parameter changes. Arrays are of JAX or of NumPy.
+    """
+    xp = jnp if isinstance(log_computed, jax.Array) else np
+    ratio = values / xp.exp(log_computed)
+    share = _share_of_log(log_computed, errors)
+    slope = share / xp.maximum(ratio, LOG_RATIO_FROM) + 1 - share
+    unit = xp.where(values > errors, values, errors)
+    near_zero = share < 1
+    change = -2 * (xp.log(xp.where(near_zero, unit * slope, 1.0)) - log_computed)
+    return xp.where(near_zero, change, 0.0)
+
+
+def _share_of_log(log_computed: Any, errors: Any) -> Any:
+    """Return 1 where logarithms are compared, 0 where values are."""
+    xp = jnp if isinstance(log_computed, jax.Array) else np
+    distance = xp.exp(log_computed) / xp.where(errors > 0, errors, xp.finfo(errors.dtype).tiny)
+    share = xp.clip((distance - LINEAR_TO) / (LOG_FROM - LINEAR_TO), 0.0, 1.0)
+    return share**2 * (3 - 2 * share)
 
 
 def innovations(
@@ -346,6 +372,7 @@ def log_likelihood(
     logs = jnp.stack([log_T, log_T + jnp.log(jnp.where(ratio > 0, ratio, 1.0))], axis=1)
     residuals = log_ratio(observed.values, logs, observed.errors)
     variances = (observed.errors / jnp.exp(logs)) ** 2
+    density_change = log_density_change(observed.values, logs, observed.errors)
     columns = [residuals]
     widths = []
     for name, shape in ((ROTATION, (0.0, 1.0)), (CALIBRATION, (1.0, 1.0))):
@@ -388,6 +415,7 @@ def log_likelihood(
     value = jax.scipy.special.logsumexp(
         jax.vmap(of_scatter, in_axes=(-1, -1, 0))(values, spread, jnp.asarray(log_scatters))
     )
+    value = value - 0.5 * jnp.sum(used * density_change)
     if rows.displacement is not None:
         assert computed.displacement is not None
         counts = collisions[place]

@@ -8,7 +8,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import scipy  # which imports scipy.stats at its first use
 
+from jaxgran.data.drop_test import DropTest
 from jaxgran.fitting.alternatives import DECLARABLE, Explanations
 from jaxgran.fitting.result import CONDITIONAL, Fit
 from jaxgran.models.base import Limitation
@@ -16,6 +18,9 @@ from jaxgran.scene.parameters import symbol_of, unit_of
 
 SIGNIFICANCE = 0.01
 """Level of significance of the test of the misfit, half of it on each side."""
+
+RISING_SIGNIFICANCE = 0.05
+"""Level at which T is found to rise: of four rising values the probability by chance is 0.04."""
 
 NEGLIGIBLE_SHARE = 0.01
 """Share of an estimate below which the low end of a range counts as 0."""
@@ -69,6 +74,10 @@ MESSAGES = {
     "as few": " (some {number:.2g} grains would scatter as much)",
     "too smooth": "the curve scatters less than N equal spheres do: grains that walls cool, more "
     "grains than told, or a curve that was smoothed",
+    "rising": "T rises from {first:.3g} to {last:.3g} m^2/s^2, and nothing drives this gas: "
+    "scatter does not explain it",
+    "gravity": "gravity is taken as absent: .01 g in a box with dissipating walls (restitution .8) "
+    "made A 9 % too small",
     "errors too large": "the residuals are smaller than the errors of T allow by chance: these "
     "errors are too large, or they are common to the points",
     "scatter": "the scatter is that of {number:.3g} +- {error:.2g} grains",
@@ -88,6 +97,8 @@ MESSAGES = {
     "{factor:.2g} times smaller",
     "outliers": "far outliers at {places}: check them and their error bars",
     "without outliers": "; without them {symbol} is {value:.3g} +- {error:.2g}",
+    "distant": "every T differs from the fitted one by more than a factor of {ratio:g}: "
+    "alternatives were not compared; check the units, the scale of T and T0",
     "max_steps": "the search did not converge: increase max_steps or free fewer parameters",
     "simulations": "{number} simulations were run; their noise is at most {share:.0f} % of the "
     "standard error",
@@ -136,10 +147,12 @@ def with_words(
     limitations = tuple(sorted(limitations, key=lambda limitation: not limitation.decisive))
     rough = result.p_value < SIGNIFICANCE / 2
     smooth = result.smooth_p_value < SIGNIFICANCE / 2
-    is_misfit = rough or (smooth and measurement_share < 0.5)
+    rising = list(_rising(result))
+    is_misfit = rough or (smooth and measurement_share < 0.5) or bool(rising)
     grade, verdict = _verdict(result, is_misfit, limitations)
     reasons = [
         _chi2(result),
+        *rising,
         *_misfit(result, rough, smooth, is_misfit),
         *_scatter(result),
         *_of_each(result),
@@ -157,6 +170,17 @@ def with_words(
         verdict=verdict,
         reasons=tuple(reasons),
     )
+
+
+def _rising(result: Fit) -> Iterator[str]:
+    """Yield a clause on curves without errors that rise; scatter would be found to explain them."""
+    for m in result.measurements.values():
+        if isinstance(m.data, DropTest) or m.gas.drive is not None:
+            continue
+        T = np.asarray(m.data.temperature)
+        trend = scipy.stats.kendalltau(np.arange(T.size), T, alternative="greater")
+        if m.data.temperature_error is None and trend.pvalue < RISING_SIGNIFICANCE:
+            yield say("rising", first=T[0], last=T[-1])
 
 
 def _unit_of(result: Fit) -> dict[str, str]:

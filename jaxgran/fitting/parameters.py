@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran._utils.validation import Domain
-from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.curve import CoolingCurve, above_noise
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import DENSITY, START_TIME, Priors, prior_domain
 from jaxgran.scene.gas import Gas, law_fields
@@ -117,7 +117,7 @@ def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
         curve: the measured curve.
         free: names of the free parameters.
     """
-    times, T = np.asarray(curve.times), np.asarray(curve.temperature)
+    times, T = _above_noise(curve)
     power, line = _power_and_line(gas, curve)
     scale, origin = T[0], (np.asarray(gas.temperature) / T[0]) ** -power
     values: dict[str, Any] = {}
@@ -198,7 +198,7 @@ def guess_start_time(
     t0, error = known
     if START_TIME not in free or "temperature" in free:
         return t0
-    times, T = np.asarray(curve.times), np.asarray(curve.temperature)
+    times, T = _above_noise(curve)
     since = times - times[0]
     power, line = _power_and_line(gas, curve)
     intercept, slope = _intercept_and_slope(since, line)
@@ -209,14 +209,20 @@ def guess_start_time(
 
 def halving_time(curve: CoolingCurve) -> float:
     """Return the time from the first point to that below half of its T, or to the last one."""
-    times, T = np.asarray(curve.times), np.asarray(curve.temperature)
+    times, T = _above_noise(curve)
     halved = np.concatenate([T[:-1] < 0.5 * T[0], np.ones(1, bool)])
     return float(times[np.argmax(halved)] - times[0])
 
 
+def _above_noise(curve: CoolingCurve) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times and T of the rows from which parameters can be guessed."""
+    rows = above_noise(curve)
+    return np.asarray(curve.times)[rows], np.asarray(curve.temperature)[rows]
+
+
 def _power_and_line(gas: Gas, curve: CoolingCurve) -> tuple[float, np.ndarray]:
     """Return the negative power of T that is a straight line in time, and that line, 1 at first."""
-    T = np.asarray(curve.temperature)
+    _, T = _above_noise(curve)
     power = power_of_line(gas)
     return power, (T / T[0]) ** -power
 
@@ -243,7 +249,8 @@ def _guess_elements(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> dic
     cooling rate.
     """
     measured = curve.rotational_temperature
-    times, T, T_0 = (np.asarray(x) for x in (curve.times, curve.temperature, gas.temperature))
+    times, T = _above_noise(curve)
+    T_0 = np.asarray(gas.temperature)
     T_rot = 0.1 * T_0
     if measured is not None:
         T_rot = np.maximum(np.asarray(measured)[0], np.asarray(measured)[1])

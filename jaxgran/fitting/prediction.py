@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from jaxgran._utils.tracing import fast_compilation
 from jaxgran.data.measurement import START_TIME
-from jaxgran.fitting.likelihood import Nodes, filtered, innovations
+from jaxgran.fitting.likelihood import Nodes, filtered, innovations, log_density_change
 from jaxgran.fitting.parameters import as_floats, power_of_line, with_floats
 from jaxgran.fitting.rows import (
     CALIBRATION,
@@ -153,12 +153,13 @@ class PredictedCurve:
             sources: factors of the variances by "measurement", "few particles", "model" and
                 "simulation"; 1 by default.
         """
-        values, variances = self._around(sources)
+        values, variances, changes = self._around(sources)
         step = DIFFERENCE
         value = values[0]
         variance = variances[0]
         slopes = np.zeros((value.size, size))
         log_slopes = np.zeros((value.size, size))
+        whitened = value / np.sqrt(variance)
         moving = [e for e in self.elements if e.name != DISPLACEMENT]
         for k, element in enumerate(moving):
             up = 1 + 2 * k
@@ -167,8 +168,12 @@ class PredictedCurve:
             slopes[:, element.place] = change / (2 * step) / np.sqrt(variance)
             growth = np.log(variances[up] / variances[down])
             log_slopes[:, element.place] = growth / (2 * step)
-        whitened = value / np.sqrt(variance)
-        rows = [Residuals("curve", self.rows.label, whitened, slopes, np.log(variance), log_slopes)]
+            # Where T is compared, slopes become those of (y - T)/error, and log_slopes 0.
+            change = (changes[up] - changes[down]) / (2 * step)
+            slopes[:, element.place] += 0.5 * whitened * change
+            log_slopes[:, element.place] += change
+        log_variance = np.log(variance) + changes[0]
+        rows = [Residuals("curve", self.rows.label, whitened, slopes, log_variance, log_slopes)]
         if self.rows.displacement is not None:
             rows.append(self._displacement(self.rows.displacement, size))
         return rows
@@ -178,8 +183,9 @@ class PredictedCurve:
         pairs = zip(self.elements, self.tangents, strict=True)
         return [tangent for element, tangent in pairs if element.name != DISPLACEMENT]
 
-    def _around(self, sources: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
-        """Return innovations and variances at the unknowns and at two neighbours in each of them.
+    def _around(self, sources: dict[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return innovations and variances at the unknowns and at two neighbours in each of them,
+        and what -2 ln L gains where T is compared in place of ln T (`log_density_change`).
 
         The shapes are (1 + 2 unknowns, 2 times): those of T are followed by those of T_rot. The
         factor of <dr^2> is left out.
@@ -206,12 +212,15 @@ class PredictedCurve:
         compiled = _compiled(innovations, jax.default_backend())
         found = compiled(gas, nodes, compared, T / (T + floor), observed, noise)
         # Values of T are followed by those of T_rot.
-        values, variances = (
+        changes = log_density_change(
+            observed.values[..., None], compared, observed.errors[..., None]
+        )
+        values, variances, changes = (
             np.asarray(x)[self.place, :, :count].transpose(2, 1, 0).reshape(count, -1)
-            for x in found
+            for x in (*found, changes)
         )
         used = self.rows.used.T.ravel()
-        return values, np.where(used > 0, variances, 1.0)
+        return values, np.where(used > 0, variances, 1.0), np.where(used > 0, changes, 0.0)
 
     def whiten(
         self, columns: Float[np.ndarray, "values columns"], **sources: float

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxgran.data.curve import above_noise
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.header import GUESS
 from jaxgran.fitting.messages import SIGNIFICANCE
@@ -99,9 +100,10 @@ def _scene(result: Fit, label: str) -> Iterator[str]:
         yield f"drops    {name}{v.size} impacts, v = {v.min():.3g} .. {v.max():.3g} m/s"
         return
     T = np.asarray(measurement.data.temperature)
+    last = T[above_noise(measurement.data)][-1]
     times = np.asarray(measurement.data.times)
     yield f"curve    {name}{T.size} points, t = {times[0]:.6g} .. {times[-1]:.6g} s,"
-    yield f"         T falls to {T[-1] / T[0]:.3g} of its first value"
+    yield f"         T falls to {last / T[0]:.3g} of its first value"
     header = dict(measurement.header)
     if "T_from" in header:
         yield f"         {header['T_from']}"

@@ -292,7 +292,8 @@ def curve_rows(
     if np.asarray(curve.times)[0] == 0 and not _has_error_at_first(measurement):
         used[0, 0] = float(fits_T_0)
         used[0, 1] = 0.0
-    used[:, 1] *= T_rot > 0
+    given_error = np.asarray(0.0 if given[1] is None else given[1])
+    used[:, 1] *= (T_rot > 0) | (given_error > 0)
     N = measurement.num_particles
     total = (UNKNOWN_NUMBER if N is None else N) * measurement.replicas
     tracked = measurement.tracked

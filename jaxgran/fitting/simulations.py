@@ -575,10 +575,10 @@ def _from_start(gas: Gas, curve: CoolingCurve) -> CoolingCurve:
     """Return T, a_2, collisions and T_rot of a curve from t = 0 on."""
     names = ("temperature", "sonine", "collisions", "rotational_temperature")
     known = {name: getattr(curve, name) for name in names if getattr(curve, name) is not None}
-    known |= {"times": curve.times}
+    known |= {"times": curve.times, "status": np.zeros((), int)}
     if float(curve.times[0]) > 0:
-        firsts = {name: gas.floats.get(name, 0.0) for name in known}
-        known = {name: np.append(np.asarray(firsts[name]), x) for name, x in known.items()}
+        firsts = {name: gas.floats.get(name, 0.0) for name in known if name != "status"}
+        known |= {name: np.append(np.asarray(first), known[name]) for name, first in firsts.items()}
     return CoolingCurve(**as_jax_arrays(known))
 
 

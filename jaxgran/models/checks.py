@@ -16,6 +16,7 @@ from jaxgran.data.curve import CoolingCurve, Run
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.particles.run import MIN_BOX
 from jaxgran.particles.setup import PACKING_LIMIT
+from jaxgran.particles.snapshot import nan_where
 from jaxgran.scene.elements import VOLUME_TOLERANCE, container_volume_ratio
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import NODES
@@ -44,6 +45,8 @@ def checked_gas(gas: Any) -> Gas:
     if not isinstance(gas, Gas):
         raise ValueError(f"gas must be a jaxgran.Gas, got {type(gas).__name__}")
     gas.check_single()
+    for name, value in gas.floats.items():  # changed by equinox.tree_at, they were not checked
+        gas.domains[name].check(name, value)
     return gas
 
 
@@ -163,10 +166,14 @@ def check_volume(gas: Gas, num_particles: int) -> None:
         return
     phi, share = float(gas.packing_fraction), container_volume_ratio(gas, num_particles)
     if abs(share - 1) > VOLUME_TOLERANCE:
+        ways = [f"enlarge the container {share:.4g} times"] if share > 1 else []
+        if gas.domains["packing_fraction"].contains(phi * share):
+            ways.append(f"set packing_fraction={phi * share:.4g}")
+        if num_particles / share >= 2:
+            ways.append(f"use {num_particles / share:.0f} particles")
         raise ValueError(
             f"{num_particles} spheres of packing_fraction {phi:.4g} need a container {share:.4g} "
-            f"times as large as that of side {np.asarray(walls.side)} m. Set packing_fraction="
-            f"{phi * share:.4g}, or use {num_particles / share:.0f} particles."
+            f"times as large as that of side {np.asarray(walls.side)} m: {', or '.join(ways)}."
         )
 
 
@@ -234,7 +241,19 @@ def limitations_of_homogeneity(gas: Gas, num_particles: int | None) -> tuple[Lim
                 f"the box, {box / diameter:.3g} diameters, is above "
                 f"L_c = {critical / diameter:.3g}: a flow grows, and clusters after it"
             )
-    return tuple(Limitation(words, False, POSITIONS_NEEDED) for words in effects)
+    limitations = [Limitation(words, False, POSITIONS_NEEDED) for words in effects]
+    phi = float(gas.packing_fraction)
+    if phi > CRYSTAL[gas.dimension]:
+        words = (
+            f"packing_fraction {phi:.3g} is above {CRYSTAL[gas.dimension]:g}, where spheres form a "
+            "crystal or a glass, and the contact value is that of a fluid"
+        )
+        limitations.append(Limitation(words, True, POSITIONS_NEEDED))
+    return tuple(limitations)
+
+
+CRYSTAL = {2: 0.72, 3: 0.545}
+"""Packing fraction above which hard disks and spheres are a crystal, by dimension."""
 
 
 def describe_walls(gas: Gas, num_particles: int) -> str:
@@ -262,19 +281,43 @@ def valid_where_traced(
         The gas, nan where a traced float is out of range; the times, replaced if traced ones do not
         increase from 0 or later; and True if all values were allowed, None if nothing is traced.
     """
-    if all(map(is_known, (times, *jax.tree.leaves(gas)))):
+    if not any_traced(gas, times):
         return gas, times, None
+    # Also values that are known and only carry a tangent, which `Gas` does not check.
     traced = {name: gas.value(name) for name in gas.domains}
-    traced = {name: value for name, value in traced.items() if not is_known(value)}
+    traced = {name: value for name, value in traced.items() if any_traced(value)}
     allowed = jnp.ones((), bool)
     for name, value in traced.items():
         allowed &= jnp.all(gas.domains[name].contains(value))
-    gas = gas.replace(**{name: jnp.where(allowed, x, jnp.nan) for name, x in traced.items()})
-    if not is_known(times):
+    one_or_nan = jnp.where(allowed, 1.0, jnp.nan)
+    # A product, so that derivatives are nan, too: an optimiser would take 0 for a minimum.
+    gas = gas.replace(**{name: x * one_or_nan.astype(x.dtype) for name, x in traced.items()})
+    if any_traced(times):
         increase = jnp.all(jnp.diff(times) > 0) & (times[0] >= 0) & jnp.isfinite(times[-1])
         allowed &= increase
         times = jnp.where(increase, times, jnp.arange(1.0, 1.0 + times.size, dtype=times.dtype))
     return gas, times, allowed
+
+
+def unknown_curve(
+    model: AbstractModel, gas: Gas, times: Float[Array, "times"], run: Run
+) -> CoolingCurve:
+    """Return a curve of the shapes of a run, which is nan, in the values and derivatives of a gas.
+
+    It stands for a run with numbers that are known, and not allowed.
+    """
+    options = Run(run.key, save=run.save)
+    shapes = eqx.filter_eval_shape(
+        lambda gas, times: model.simulate(gas, times, options), gas, times
+    )
+    traced = (gas.value(name) for name in gas.domains)
+    total = sum((jnp.sum(x) for x in traced if any_traced(x)), start=jnp.zeros(())) * jnp.nan
+
+    def filled(shape: jax.ShapeDtypeStruct) -> Array:
+        zeros = jnp.zeros(shape.shape, shape.dtype)
+        return zeros + total.astype(shape.dtype) if eqx.is_inexact_array(zeros) else zeros
+
+    return jax.tree.map(filled, shapes)
 
 
 def nan_unless(
@@ -284,9 +327,7 @@ def nan_unless(
     if allowed is None:
         return curve
     fault = status.flag(status.OUT_OF_RANGE, ~allowed)
-    masked = jax.tree.map(
-        lambda x: jnp.where(allowed, x, jnp.nan) if eqx.is_inexact_array(x) else x, curve
-    )
+    masked = jax.tree.map(lambda x: nan_where(~allowed, x), curve)
     fault = fault if curve.status is None else jnp.where(allowed, curve.status, fault)
     return dataclasses.replace(masked, times=times, status=fault)
 

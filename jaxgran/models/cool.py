@@ -11,7 +11,9 @@ from jax.core import Tracer
 from jaxtyping import ArrayLike, PRNGKeyArray
 
 from jaxgran._utils import status
+from jaxgran._utils.tracing import is_known
 from jaxgran._utils.validation import check_bool, checked_times
+from jaxgran.data.checkpoint import saved_at_termination
 from jaxgran.data.curve import CoolingCurve, Particles, Run
 from jaxgran.data.files import check_writable
 from jaxgran.models import checks
@@ -56,9 +58,9 @@ def cool(
             of spheres share their step lengths and the lifetimes of their neighbour lists.
         progress: show a progress bar on a terminal during a run of some seconds.
         checkpoint: path of a file for particle models. The run is saved there each minute and when
-            it is interrupted, and is resumed from it; a resumed run gives the same numbers bit for
-            bit. Replicas that are separate runs write one file each, with the suffixes .0, .1, ...
-            Not inside `jax.jit` and `jax.vmap`.
+            it is interrupted, by Ctrl-C or SIGTERM, and is resumed from it; a resumed run gives the
+            same numbers bit for bit. Replicas that are separate runs write one file each, with the
+            suffixes .0, .1, ... Not inside `jax.jit` and `jax.vmap`.
         save: function for models with particles, which JAX can compile. It takes the `Particles` of
             one replica (arrays of shape (N, d), SI) and returns a pytree of arrays; see
             `jaxgran.observables`. Its mean over replicas at each time is ``curve.saved``, its
@@ -112,7 +114,12 @@ def cool(
         check_writable(os.fspath(checkpoint))
     model.check_scene(gas)
     gas, simulated, allowed = checks.valid_where_traced(gas, times)
-    curve = model.simulate(gas, simulated, Run(key, progress, checkpoint, save, trajectory))
+    run = Run(key, progress, checkpoint, save, trajectory)
+    if allowed is not None and is_known(allowed) and not allowed:
+        curve = checks.unknown_curve(model, gas, simulated, run)
+    else:
+        with saved_at_termination(checkpoint):
+            curve = model.simulate(gas, simulated, run)
     curve = checks.nan_unless(allowed, curve, times)
     if throw and curve.status is not None and not isinstance(curve.status, Tracer):
         _raise_if_failed(curve, gas)

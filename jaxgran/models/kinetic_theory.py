@@ -387,23 +387,24 @@ class KineticTheory(AbstractModel):
         length = gas.path_length
         fault = fault | status.flag(status.UNSUPPORTED, ~self._is_sound(gas))
         theta = jnp.exp(state.log_temperature)
-        # Added last: compiled in float32, exp(nan) can be a number (jaxlib 0.10.1 on a CPU).
-        nan_if_failed = jnp.where(fault == status.OK, 0.0, jnp.nan).astype(theta.dtype)
-        temperature = gas.temperature * theta + nan_if_failed
+        # The last factor: compiled in float32, exp(nan) can be a number (jaxlib 0.10.1 on a CPU).
+        # A factor makes derivatives nan, too.
+        one_or_nan = jnp.where(fault == status.OK, 1.0, jnp.nan).astype(theta.dtype)
+        temperature = gas.temperature * theta * one_or_nan
         optional = {}
         if state.third_sonine is not None:
-            optional["third_sonine"] = state.third_sonine + nan_if_failed
+            optional["third_sonine"] = state.third_sonine * one_or_nan
         if state.rotation is not None:
             optional["rotational_temperature"] = temperature * state.rotation
         if state.diffusion is not None and state.displacement is not None:
             diffusion = state.diffusion * jnp.sqrt(theta) * length * gas.impact_speed
-            optional["diffusion"] = diffusion + nan_if_failed
-            optional["displacement"] = state.displacement * length**2 + nan_if_failed
+            optional["diffusion"] = diffusion * one_or_nan
+            optional["displacement"] = state.displacement * length**2 * one_or_nan
         return CoolingCurve(
             times=times,
             temperature=temperature,
-            sonine=state.sonine + nan_if_failed,
-            collisions=state.collisions + nan_if_failed,
+            sonine=state.sonine * one_or_nan,
+            collisions=state.collisions * one_or_nan,
             status=fault,
             **optional,
         )

@@ -148,7 +148,7 @@ def curve_of_program(
     values = dict(linearise(simple, complete, times, ()).values)
     for name in ("displacement", "diffusion"):
         values.pop(name, None)
-    return CoolingCurve(**as_jax_arrays({"times": times} | values))
+    return CoolingCurve(**as_jax_arrays({"times": times, "status": np.zeros((), int)} | values))
 
 
 def _linearised(

@@ -95,8 +95,9 @@ class AbstractParticleModel(AbstractModel):
         """Return the curve of a run in SI, with nan at invalid times."""
         others, energy = {}, gas.mass * gas.temperature
         scales = {"1": 1.0, "m^2": units.length**2, "m^2/s^2": gas.temperature, "J": energy}
+        one_or_nan = jnp.where(invalid[None], jnp.nan, jnp.ones_like(gas.temperature))
         values = {
-            name: jnp.where(invalid[None], jnp.nan, out.records[name].T * scales[quantity.unit])
+            name: out.records[name].T * scales[quantity.unit] * one_or_nan
             for name, quantity in QUANTITIES.items()
             if name in out.records
         }

@@ -41,7 +41,7 @@ from jaxtyping import Array, ArrayLike, PRNGKeyArray
 from tqdm import tqdm
 
 from jaxgran._utils import status
-from jaxgran._utils.tracing import concrete_array, fast_compilation
+from jaxgran._utils.tracing import concrete_array, fast_compilation, near_map_limit
 from jaxgran.data import checkpoint
 from jaxgran.data.checkpoint import describe_run
 from jaxgran.data.curve import Particles, Run
@@ -60,6 +60,11 @@ from jaxgran.particles.state import State, centred, copy_buffers
 
 EQUILIBRATION_COLLISIONS = 10.0
 """Duration of the equilibration, in mean free times."""
+
+MAX_EQUILIBRATION = 2e4
+"""Longest equilibration, in diameters over the thermal speed. Below a packing fraction of 6e-5
+random positions are those of a gas, but for a share of this size, and flights of many boxes would
+take minutes."""
 
 SETTLING_COLLISIONS = 2.0
 """Mean free times of equilibration after which the capacity of the run is sufficient."""
@@ -115,7 +120,8 @@ class Simulation(NamedTuple):
     @property
     def equilibration_time(self) -> Array:
         """Duration of the equilibration."""
-        return EQUILIBRATION_COLLISIONS / self.dynamics.scene.collision_frequency
+        collisions = EQUILIBRATION_COLLISIONS / self.dynamics.scene.collision_frequency
+        return jnp.minimum(collisions, MAX_EQUILIBRATION).astype(collisions.dtype)
 
     @property
     def key(self) -> PRNGKeyArray:
@@ -429,6 +435,7 @@ def run_through_times(
                     # An interruption saves the state before the current call.
                     given = state if path is None else copy_buffers(state)
                     state = advance(given, float(times[num_done]))
+                    checkpoint.stop_if_terminated()
                     num_stalled = num_stalled + 1 if float(state.time) <= now else 0
                     if num_stalled >= MAX_STALLED:
                         raise RunFailure(status.STALLED.bit)
@@ -485,6 +492,9 @@ def compiling(program: Hashable, progress: bool) -> Iterator[bool]:
     follows.
     """
     new, text = program not in _COMPILED, "compiling ..."
+    if new and near_map_limit():
+        jax.clear_caches()
+        _COMPILED.clear()
     _COMPILED.add(program)
     shown = new and progress and sys.stderr.isatty()
     if shown:

@@ -96,7 +96,8 @@ def _as_array(leaf: Any) -> Array:
 
 
 def nan_where(failed: Bool[Array, "..."], x: Array) -> Array:
-    """Return a record with nan where a run failed; integers have no nan and stay as they are."""
+    """Return a record with nan where a run failed, also in derivatives, but no nan in integers."""
     if not jnp.issubdtype(x.dtype, jnp.inexact):
         return x
-    return jnp.where(failed.reshape(*failed.shape, *[1] * (x.ndim - failed.ndim)), jnp.nan, x)
+    failed = failed.reshape(*failed.shape, *[1] * (x.ndim - failed.ndim))
+    return x * jnp.where(failed, jnp.nan, 1.0).astype(x.dtype)

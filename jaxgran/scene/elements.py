@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxgran._utils.tracing import is_known
-from jaxgran._utils.validation import FRACTION, Domain, number_named
+from jaxgran._utils.validation import FRACTION, Domain
 from jaxgran.scene.laws import ConstantRestitution, RestitutionLaw
-from jaxgran.scene.parameters import ADVICE, Parameter, fields_of
+from jaxgran.scene.parameters import ADVICE, Parameter, fields_of, number_named
 
 NUM_SPIN_COMPONENTS = {2: 1, 3: 3}
 """Number of components of the angular velocity, d_rot, by dimension."""

@@ -24,12 +24,19 @@ from jaxgran._utils.validation import (
     UserNumber,
     checked_int,
     float_array,
-    number_named,
 )
 from jaxgran.scene import elements, laws
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME, ELASTIC_OVERLAP
 from jaxgran.scene.geometry import CLOSE_PACKING, contact_value, impact_average, sphere_surface
-from jaxgran.scene.parameters import ADVICE, FLOAT_UNITS, PREFIXES, domains_of, fields_of
+from jaxgran.scene.parameters import (
+    ADVICE,
+    FLOAT_UNITS,
+    PREFIXES,
+    domains_of,
+    fields_of,
+    number_named,
+    unit_of,
+)
 
 
 class FloatField(NamedTuple):
@@ -199,11 +206,12 @@ class Gas(eqx.Module):
             ValueError: for an unknown name or a value outside its range.
         """
         fields = self._float_fields
+        arrays = []
         for name, value in values.items():
             self.value(name)
             fields[name].domain.check(name, value)
+            arrays.append(float_array(value, name, unit_of(name)))
 
-        arrays = [float_array(value) for value in values.values()]
         return eqx.tree_at(
             lambda module: [fields[name].get(module) for name in values], self, arrays
         )

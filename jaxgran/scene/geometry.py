@@ -40,7 +40,8 @@ def sphere_mass(diameter: UserNumber, density: UserNumber) -> Float[Array, "..."
     """
     POSITIVE.check("diameter", diameter, "Give the diameter in metres.")
     POSITIVE.check("density", density, "Give the density of the material in kg/m^3.")
-    return pi / 6 * float_array(density) * float_array(diameter) ** 3
+    diameter = float_array(diameter, unit="m")
+    return pi / 6 * float_array(density, unit="kg/m^3") * diameter**3
 
 
 def contact_value(packing_fraction: ArrayLike, dimension: int) -> Any:

@@ -26,10 +26,9 @@ from jaxgran._utils.validation import (
     check_bool,
     checked_float,
     float_array,
-    number_named,
 )
 from jaxgran.scene import contact
-from jaxgran.scene.parameters import ADVICE, domains_of
+from jaxgran.scene.parameters import ADVICE, domains_of, number_named
 
 _UNITS_ADVICE = (
     "a reduced law gets speeds in units of `speed`: leave `reduced` out and let "

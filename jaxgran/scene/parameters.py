@@ -4,8 +4,10 @@ Elements, laws and `Gas` take the ranges of their fields from it, curve files th
 the command line the arguments of --free.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
+from jaxgran._utils import validation
 from jaxgran._utils.validation import ANY, FRACTION, NON_NEGATIVE, POSITIVE, Domain
 
 SCENE, MATERIAL = "scene", "material"
@@ -112,6 +114,11 @@ def symbol_of(name: str) -> str:
 def unit_of(name: str) -> str:
     """Return the unit of a parameter, which may begin with a label; "" if it has none."""
     return FLOAT_UNITS.get(name.rpartition(": ")[2], "")
+
+
+def number_named(name: str) -> Callable[[Any], Any]:
+    """Return a converter of `equinox.field` to a float array, in the unit of a parameter."""
+    return validation.number_named(name, unit_of(name))
 
 
 def fields_of(owner: str) -> dict[str, Parameter]:

@@ -1,17 +1,28 @@
 """Curve files as people write them, and files whose header and columns contradict each other."""
 
 import codecs
+import gzip
+import io
+import os
 import re
+import threading
 import warnings
+import zipfile
+from datetime import timedelta
 
+import jax.numpy as jnp
 import numpy as np
+import pint
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pytest import approx
 
 import jaxgran
 from jaxgran import read_curve, read_measurement, write_curve
+from jaxgran.data import files
 from jaxgran.data.header import absent_of_header, gas_of_header, priors_of_header
+from jaxgran.data.tables import header_in_si
 
 KEYS = {"N": 2000, "eta": 0.04, "diameter": 0.003, "density": 1200, "Y": 2e7, "nu": 0.3, "T0": 0.02}
 
@@ -30,6 +41,9 @@ TIMES = np.geomspace(0.02, 60.0, 40)
 TRUE_A = 4e-6
 CURVE = jaxgran.cool(GAS.replace(dissipative_constant=TRUE_A), TIMES)
 T = np.asarray(CURVE.temperature) * (1 + 0.005 * np.sin(7.0 * np.arange(40)))
+
+
+SPEED_XY = np.sqrt(np.pi / 2 * T)
 
 
 def text_of(names="t,T,T_err", columns=(TIMES, T, 0.01 * T), *, row=None, **keys):
@@ -65,14 +79,43 @@ READ = {
     "a unit of a value": text_of(diameter="3 mm", density="1.2 g/cm^3", Y="20 MPa"),
     "per cent": text_of(eta="4 %"),
     "a late clock, told": text_of("t,T", (TIMES + 1000, T), t0=1000, t0_err=1),
+    "projected speeds": text_of("t,mean_speed_xy", (TIMES, SPEED_XY)),
+    "v^2": text_of("t,v2", (TIMES, 3 * T)),
+    "the energy of all": text_of("t,total_energy", (TIMES, 3000 * float(GAS.mass) * T)),
+    "errors in per cent": text_of("t,T,T_err (%)", (TIMES, T, np.ones(40)), eta_err="5 %"),
+    "values with errors": text_of(eta="0.040 ± 0.002", diameter="3.00(5) mm", Y="20 +/- 1 MPa"),
+    "values with errors in brackets": text_of(Y="(20 +- 1) MPa", T0="200(5) cm^2/s^2"),
+    "units without blanks, phi": text_of(eta=None, phi=".04", diameter="3mm"),
+    "comments of %": PLAIN.replace("# ", "% "),
+    "a row of units": PLAIN.replace("t,T,T_err\n", "t,T,T_err\n(s),(m^2/s^2),(m^2/s^2)\n"),
     "speeds in mm/s, T0 too": "# time_unit: ms\n# speed_unit: mm/s\n"
     + text_of("t,T", (1e3 * TIMES, 1e6 * T), T0=2e4),
 }
 """Files that are read as the plain one, without a question."""
 
 QUESTIONED = {
-    "twice T": (text_of("t,T", (TIMES, 2 * T)), "1.9.* times .*T0 = 0.02.*Is it twice T.*by 0.5"),
+    "twice T": (text_of("t,T", (TIMES, 2 * T)), "1.9.* times .*T0 = 0.02.*twice T.*by 0.5"),
     "<v^2>": (text_of("t,T", (TIMES, 3 * T)), "<v.2>, not divided by the dimension.*by 0.333"),
+    "projected speeds": (
+        text_of("t,mean_speed", (TIMES, SPEED_XY), T0=0.02 * np.pi**2 / 16),
+        "A 37 % too large: name the column mean_speed_xy",
+    ),
+    "projected speeds, true T0": (
+        text_of("t,mean_speed", (TIMES, SPEED_XY)),
+        "name the column mean_speed_xy, or multiply T by 1.62",
+    ),
+    "T of disks over 3": (text_of("t,T", (TIMES, 2 / 3 * T), dimension=2), "multiply it by 1.5"),
+    "one component over 3": (text_of("t,T", (TIMES, T / 3)), "one component over 3.* by 3"),
+    "T/T0, T0: 1": (text_of("t,T", (TIMES, T / 0.02), T0=1), "T0 is 1 m.*divided by its first"),
+    "the energy of all": (
+        text_of("t,energy", (TIMES, 3000 * float(GAS.mass) * T)),
+        "energy of all N .*total_energy, or multiply it by 0.0005",
+    ),
+    "T0 in kelvin, too": (
+        text_of("t,T", (TIMES, 1e17 * T), T0=2e15),
+        "T0 is 2e.15 m.2/s.2, .*kelvin times 1.38e-23 J/K over the mass",
+    ),
+    "an error larger than its value": (text_of(nu_err=0.4), "nu_err is 0.4 .* more than nu, 0.3"),
     "T/T0": (text_of("t,T", (TIMES, T / 0.02)), "is the column T over T0.*multiply it by 0.02"),
     "kelvin, untold": (
         text_of("t,T", (TIMES, T * float(GAS.mass) / 1.380649e-23)),
@@ -111,7 +154,7 @@ REFUSED = {
     # Names and units.
     "missing: T; name them t,T": "t,T_err\n1,2\n",
     "missing: t; not known: when": "when,T\n1,2\n",
-    "missing: T; not known: speed; .* there may be mean_speed, vx2, v2_xy": "t,speed\n1,2\n",
+    "missing: T; not known: speed; .* there may be vx2, v2_xy, v2, energy": "t,speed\n1,2\n",
     "missing: T; not known: vx2_err": "t,vx2_err\n1,2\n",
     "each once": "t,T,T\n1,2,3\n",
     "T and vx2 each give the temperature; keep one": "t,T,vx2\n1,2,3\n",
@@ -124,6 +167,12 @@ REFUSED = {
     # Values.
     "line 4: t is 1 after 1; times must increase: sort the rows": "t,T\n0,1\n1,.5\n1,.3\n",
     "line 2: t is -1, it must be a positive number": "t,T\n-1,1\n2,.5\n3,.3\n",
+    "line 1 begins with '!'.* begin with # or %": PLAIN.replace("# ", "! "),
+    "write errors into a column of their own": text_of(row="0.04,0.019 ± 0.001,1e-4"),
+    "eta: '0.04.* gives eta_err again": text_of(eta="0.04 ± 0.01", eta_err="0.02"),
+    "header line eta: '_0e-2' is not known": text_of(eta="1_0e-2"),
+    "'m..9..9..9' is not known as a unit of m": text_of(diameter="2 m**9**9**9"),
+    "field larger than field limit": text_of(row="x" * 200_000),
     "line 3: T is 0, it must be a positive number": "t,T\n0,1\n1,0\n2,.3\n",
     "line 3: T_err is 0": "t,T,T_err\n0,1,0\n1,.5,0\n2,.3,.1\n",
     "line 3: msd is -1": "t,T,msd\n0,1,0\n1,.5,-1\n2,.3,.1\n",
@@ -133,11 +182,11 @@ REFUSED = {
 """What is said of a file that is refused, and the file."""
 
 
-def said(path):
+def said(path, header=None):
     """Read a file; return the curve, the gas and all questions."""
     with warnings.catch_warnings(record=True) as questions:
         warnings.simplefilter("always")
-        measurement = read_measurement(path)
+        measurement = read_measurement(path, header)
     words = "\n".join(str(question.message) for question in questions)
     return measurement.curve, measurement.gas, words
 
@@ -190,6 +239,9 @@ LENGTHS, DURATIONS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}, {"s": 1.0, "ms": 1e-3, 
 
 @given(
     separator=st.sampled_from([",", ";", "\t", " ", "|"]),
+    told_to_the_command=st.booleans(),
+    error=st.sampled_from(["0.002", "5 %", "±", "in brackets"]),
+    percent=st.booleans(),
     encoding=st.sampled_from(ENCODINGS),
     order=st.permutations(["t", "T", "T_err", "msd"]),
     length=st.sampled_from(list(LENGTHS)),
@@ -201,7 +253,19 @@ LENGTHS, DURATIONS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}, {"s": 1.0, "ms": 1e-3, 
 )
 @settings(max_examples=100, deadline=None)
 def test_a_file_gives_the_plain_curve_or_an_error(
-    write, separator, encoding, order, length, duration, told, comma, quotes, ends
+    write,
+    separator,
+    told_to_the_command,
+    error,
+    percent,
+    encoding,
+    order,
+    length,
+    duration,
+    told,
+    comma,
+    quotes,
+    ends,
 ):
     L, s = LENGTHS[length], DURATIONS[duration]
     values = {"t": TIMES / s, "T": T / (L / s) ** 2, "T_err": 0.01 * T / (L / s) ** 2}
@@ -211,12 +275,23 @@ def test_a_file_gives_the_plain_curve_or_an_error(
     form = {"header": "{0}", "names": "{0} [{1}]", "slashes": "{0} / ({1})"}[told]
     if told == "slashes" and separator == " ":
         form = "{0}({1})"
+    if percent:
+        values["T_err"] = np.ones_like(T)
+        units["T_err"] = "%"
+    if percent and told == "header":
+        order = ["T_err (%)" if name == "T_err" else name for name in order]
+        values["T_err (%)"], units["T_err (%)"] = values["T_err"], ""
     lines = ["# die größe: ä"]
     keys = dict(KEYS)
+    both = {"±": "0.040 ± 0.002", "in brackets": "0.040(2)"}
+    keys |= {"eta": both[error]} if error in both else {"eta_err": error}
     if told == "header":
         lines += [f"# length_unit: {length}", f"# time_unit: {duration}"]
         keys |= {"diameter": 0.003 / L, "T0": 0.02 / (L / s) ** 2}
-    lines += [f"# {key}: {value!r}" for key, value in keys.items()]
+    head = {key: str(value) for key, value in keys.items()}
+    if not told_to_the_command:
+        lines += [f"# {key}: {value}" for key, value in head.items()]
+        head = {}
     mark = '"' if quotes and separator != " " else ""
     lines.append(separator.join(mark + form.format(n, units[n]) + mark for n in order))
     rows = zip(*(values[name] for name in order), strict=True)
@@ -226,12 +301,13 @@ def test_a_file_gives_the_plain_curve_or_an_error(
     lines += [separator.join(row) for row in cells]
     content = (ends.join(lines) + ends).encode(encoding)
     if comma and separator == ",":
-        with pytest.raises(ValueError, match="(?s)curve.csv.*line 1.*comma"):
+        with pytest.raises(ValueError, match="(?s)curve.csv.*line .*comma"):
             read_curve(write(content))
         return
-    curve, gas, words = said(write(content))
+    curve, gas, words = said(write(content), head)
     assert words == ""
     assert_plain(curve, gas, rtol=1e-12)
+    assert read_measurement(write(content), head).priors["packing_fraction"][1] == approx(0.002)
     np.testing.assert_allclose(curve.times, TIMES, rtol=1e-12)
     np.testing.assert_allclose(curve.temperature_error, 0.01 * T, rtol=1e-12)
     np.testing.assert_allclose(curve.displacement, 1e-4 * TIMES, rtol=1e-12)
@@ -249,7 +325,7 @@ def test_drop_tests_are_read_like_curves(tmp_path):
         "# speed_unit: cm/s\n# length_unit: cm\nv,eps,eps_err\n10,0.92,0.01\n30,0.9,0.01\n",
         "# length_unit: cm\nv;eps;eps_err\n10;0,92;0,01\n30;0,90;0,01\n",
         "eps\teps_err\tv (mm/s)\n0.92\t0.01\t100\n0.9\t0.01\t300\n",
-        "eps,eps_err (%),v\n0.92,1,0.1\n0.9,1,0.3\n",
+        "eps (%),eps_err (%),v\n92,1,0.1\n90,1,0.3\n",
     ):
         drops = drops_of(text)
         for name in ("speed", "restitution", "error"):
@@ -361,3 +437,153 @@ def test_every_error_of_a_header_is_a_prior():
     priors = priors_of_header({"diameter": "2e-3", "diameter_err": "1e-5", "density": "2500"})
     assert priors["diameter"] == (2e-3, 1e-5) and priors["density"][0] == 2500
     assert priors["density"][1] < 1  # so that the mass follows the diameter
+
+
+def test_a_setting_counts_before_anything_is_read(write):
+    speeds = text_of("t,mean_speed", (TIMES, SPEED_XY))
+    measurement = read_measurement(write(speeds), {"dimension": 2})
+    np.testing.assert_allclose(measurement.curve.temperature, T, rtol=1e-7)
+    energies = text_of("t,energy", (TIMES, 1.5 * float(GAS.mass) * T), density=None)
+    measurement = read_measurement(write(energies), {"density": "1.2 g/cm^3"})
+    np.testing.assert_allclose(measurement.curve.temperature, T, rtol=1e-7)
+    milli = text_of("t,T", (1e3 * TIMES, T))
+    told = {"time_unit": "ms", "speed_unit": "m/s", "T0": "0.02 m^2/s^2"}
+    measurement = read_measurement(write(milli), told)
+    np.testing.assert_allclose(measurement.curve.times, TIMES, rtol=1e-7)
+    np.testing.assert_allclose(measurement.curve.temperature, T, rtol=1e-7)
+
+
+@pytest.mark.parametrize("text", ["# T: 293 K (room)\n", "# D: 3 mm\n", "# t: noon\n"])
+def test_names_of_columns_are_free_in_the_header(text, write):
+    curve, gas, words = said(write(text + PLAIN))
+    assert_plain(curve, gas)
+    assert f"ignoring unknown header keys: {text[2]}" in words
+
+
+@pytest.mark.parametrize(
+    "text", ["8 x 6 x 4 cm", "80x60x40 mm", "0.08 × 0.06 × 0.04"], ids=["cm", "mm", "metres"]
+)
+def test_a_container_has_three_sides(text):
+    header = header_of(container_side=text, wall_restitution=0.9, eta=None)
+    gas = gas_of_header(header_in_si(header))[0]
+    np.testing.assert_allclose(gas.value("wall_side"), [0.08, 0.06, 0.04])
+    volume = 2000 * np.pi / 6 * 0.003**3
+    assert float(gas.packing_fraction) == approx(volume / (0.08 * 0.06 * 0.04))
+
+
+def test_speeds_of_drop_tests_are_asked_about(tmp_path):
+    (tmp_path / "drops.csv").write_text("v,eps,eps_err\n10,0.92,0.01\n100,0.9,0.01\n")
+    with pytest.warns(UserWarning, match="v is 100 m/s, and usual is 0 to 8: is it in cm/s"):
+        read_measurement(tmp_path / "drops.csv", gas=GAS)
+
+
+def test_sizes_are_bounded_before_they_are_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "MAX_BYTES", 10**6)
+    (tmp_path / "large.csv.gz").write_bytes(gzip.compress(bytes(10**7)))
+    with pytest.raises(ValueError, match="it has more than 1e.06 bytes"):
+        read_curve(tmp_path / "large.csv.gz")
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f8", "fortran_order": False, "shape": (10**13,)}
+    )
+    with zipfile.ZipFile(tmp_path / "large.npz", "w") as archive:
+        archive.writestr("times.npy", header.getvalue())
+    with pytest.raises(ValueError, match="times.npy is shorter than its header says"):
+        read_curve(tmp_path / "large.npz")
+
+
+def test_a_pipe_is_read_once(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    writer = threading.Thread(target=pipe.write_text, args=(PLAIN,))
+    writer.start()
+    curve, gas, words = said(pipe)
+    writer.join()
+    assert words == ""
+    assert_plain(curve, gas)
+
+
+def test_tables_of_energies_are_curves(write):
+    names = "time gravitEnergy traKineticEnergy elasticEnergy"
+    energy = 3000 * float(GAS.mass) * T
+    rows = "".join(f"{t:12.8g} 0 {E:12.9g} 0\n" for t, E in zip(TIMES, energy, strict=True))
+    measurement = read_measurement(write(f"{names}\n{rows}"), header_of())
+    np.testing.assert_allclose(measurement.curve.temperature, T, rtol=1e-7)
+
+
+def test_a_curve_is_written_as_what_its_name_says():
+    with pytest.raises(ValueError, match="c.foo: a curve is written as .npz or as text, .csv"):
+        write_curve("c.foo", CURVE, {})
+
+
+def test_values_below_zero_need_errors(write):
+    below = np.where(TIMES > 30, -T, T)
+    with pytest.raises(ValueError, match="line .*if noise was subtracted, give T_err"):
+        read_measurement(write(text_of("t,T", (TIMES, below))))
+    for name, factor in (("T", 1.0), ("v2", 3.0)):
+        columns = (TIMES, factor * below, factor * (0.01 * T + 1e-4))
+        measurement = read_measurement(write(text_of(f"t,{name},{name}_err", columns)))
+        np.testing.assert_allclose(measurement.curve.temperature, below, rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "curve_of",
+    [
+        lambda u: jaxgran.CoolingCurve(1e3 * TIMES * u.ms, 1e4 * T * u.cm**2 / u.s**2),
+        lambda u: jaxgran.CoolingCurve([1e3 * t * u.ms for t in TIMES], T),
+        lambda u: jaxgran.CoolingCurve((1e9 * TIMES).astype("m8[ns]"), T),
+        lambda u: jaxgran.CoolingCurve([timedelta(seconds=t) for t in TIMES], T),
+    ],
+)
+def test_quantities_with_units_are_converted(curve_of):
+    curve = curve_of(pint.UnitRegistry())
+    np.testing.assert_allclose(curve.times, TIMES, rtol=1e-4)
+    np.testing.assert_allclose(curve.temperature, T)
+
+
+def test_a_gas_takes_quantities_with_units():
+    u = pint.UnitRegistry()
+    gas = GAS.replace(diameter=3 * u.mm, packing_fraction=4 * u.percent)
+    assert float(gas.diameter) == approx(0.003) and float(gas.packing_fraction) == approx(0.04)
+    mass = jaxgran.sphere_mass(3 * u.mm, 1.2 * u.g / u.cm**3)
+    assert float(mass) == approx(float(GAS.mass))
+    times = 1e3 * TIMES[:3] * u.ms
+    np.testing.assert_allclose(jaxgran.cool(GAS, times).times, TIMES[:3])
+    with pytest.raises(ValueError, match="expected a quantity in m.2/s.2: Cannot convert"):
+        GAS.replace(temperature=300 * u.K)
+
+
+DATES = np.datetime64("2024-05-01") + (1e3 * TIMES).astype("m8[ms]")
+WRONG_CURVES = [
+    (lambda: jaxgran.CoolingCurve(DATES, T), "got dates, .* dates - dates.0."),
+    (lambda: jaxgran.CoolingCurve(TIMES, T[:5]), "temperature has shape .5,., but times have"),
+    (lambda: jaxgran.CoolingCurve(TIMES, -T), "point 0: T is -0.01.*give T_err"),
+    (lambda: jaxgran.CoolingCurve(TIMES, np.nan * T), "point 0: T is nan"),
+    (lambda: jaxgran.CoolingCurve(TIMES[::-1], T), "times must increase"),
+    (lambda: jaxgran.CoolingCurve(TIMES, T, temperature_error=0.1), "temperature_error has shape"),
+    (
+        lambda: jaxgran.Measurement(GAS, jaxgran.CoolingCurve(TIMES[:, None], T[:, None])),
+        "one axis, got shape .40, 1.; make columns lists, as by x.ravel",
+    ),
+    (lambda: GAS.replace(diameter=jnp.array(True)), "diameter must be a number"),
+    (lambda: GAS.replace(diameter=jnp.array(1j)), "diameter must be a number"),
+]
+
+
+@pytest.mark.parametrize("call, words", WRONG_CURVES)
+def test_curves_are_checked_where_they_are_made(call, words):
+    with pytest.raises(ValueError, match=words):
+        call()
+
+
+def test_only_times_and_temperatures_go_without_a_name():
+    with pytest.raises(TypeError, match="positional"):
+        jaxgran.CoolingCurve(TIMES, T, 0.3 * T)
+
+
+def test_two_copies_are_one_measurement(write):
+    first = read_measurement(write(PLAIN))
+    for other in (PLAIN, IN_MM.replace("t,T,", "t (ms),T (mm^2/s^2),"), text_of("t,T", (TIMES, T))):
+        copies = {"a": first, "b": read_measurement(write(other))}
+        with pytest.raises(ValueError, match="'a' and 'b' hold the same values"):
+            jaxgran.fit(copies)

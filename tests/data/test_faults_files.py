@@ -133,6 +133,11 @@ PARTICLES = {
     "walls in words": ("a.xyz", xyz(head='pbc="false false True"'), "in some directions only"),
     "walls elsewhere": ("a.xyz", xyz(head='pbc="F F F" Origin="1 0 0"'), "are outside of its box"),
     "ASE's momenta": ("a.xyz", xyz(properties="species:S:1:pos:R:3:momenta:R:3"), "not momenta"),
+    "velocity in capitals": (
+        "a.xyz",
+        xyz(properties="species:S:1:pos:R:3:Velocity:R:3"),
+        None,
+    ),
     "another suffix": ("a.extxyz", xyz(), None),
     "quoted properties": ("a.xyz", xyz(properties='"species:S:1:pos:R:3:velo:R:3"'), None),
     "compressed XYZ": ("a.xyz.gz", xyz(), None),
@@ -358,3 +363,35 @@ def test_spins_and_sizes_of_a_trajectory(tmp_path):
     volume = np.pi / 6 * 0.002**3
     expected = {"diameter": 0.002, "density": 2e-6 / volume, "eta": N * volume / SIDE**3}
     assert numbers == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    "clock, scale, words",
+    [
+        ("10{k}", 1.0, "T is T0 .* at t = .* and not at 0.*--free A t0"),
+        ("{k}", 1 / 9, "times the header's T0"),
+    ],
+)
+def test_trajectories_are_questioned(tmp_path, clock, scale, words):
+    path = write(tmp_path / "a.dump", dump(head=f"ITEM: TIME\n{clock}\n"))
+    still = VELOCITY[0] - VELOCITY[0].mean(axis=0)
+    known = {"diameter": 1e-3, "density": 2500, "Y": 1e7, "nu": 0.3, "eta": 0.001}
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        jaxgran.read_curve(path, header=known | {"T0": scale * np.mean(still**2)})
+    assert re.search(words, " ".join(str(warning.message) for warning in told))
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_tracks_as_trackmate_exports_them(read, d):
+    columns, T, _ = tracks(d=3)
+    ids, t, x, y, z = columns[:5]
+    z = z * (d == 3)
+    spots = np.arange(len(ids))
+    names = "LABEL,ID,TRACK_ID,POSITION_X,POSITION_Y,POSITION_Z,POSITION_T,FRAME"
+    words = "Label,Spot ID,Track ID,X,Y,Z,T,Frame"
+    head = f"{names}\n{words}\n{words}\n,,,(mm),(mm),(mm),(ms),\n"
+    arrays = spots, spots, ids, 1e3 * x, 1e3 * y, 1e3 * z, 1e3 * t, 0 * t
+    curve, found = read(head, *arrays)
+    np.testing.assert_allclose(np.mean(curve.temperature / T), 1.0, atol=0.1)
+    assert ("two of three coordinates" in found["T_from"]) == (d == 2)

@@ -1,0 +1,95 @@
+"""Curves that a fit took at their word: values below 0, wrong units, curves that rise."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxgran
+from jaxgran.fitting.likelihood import log_density_change, log_ratio
+from tests.beads import glass_beads
+from tests.fitting.curves import fitted, synthetic
+
+A = "dissipative_constant"
+GAS = glass_beads(0.15)
+
+
+def noisy(seed, number=60):
+    """A curve half of whose values are those of the noise, which was subtracted."""
+    times = np.arange(1, number + 1) * 20 * float(GAS.mean_free_time)
+    T = np.asarray(jaxgran.cool(GAS, times).temperature)
+    error = np.hypot(0.01 * T, 2 * T[number // 3])
+    values = T + error * np.random.default_rng(seed).normal(size=number)
+    return jaxgran.CoolingCurve(times, values, temperature_error=error)
+
+
+@pytest.mark.slow
+def test_values_below_zero_leave_A_unbiased():
+    fits = [fitted(GAS, noisy(seed), quick=True) for seed in range(20)]
+    values, errors = np.transpose([fit.value(A) for fit in fits])
+    true = float(GAS.value(A))
+    scatter = values.std(ddof=1)
+    print(values.mean() / true, scatter / true / 20**0.5)
+    assert abs(values.mean() - true) < 2 * scatter / 20**0.5
+    assert 0.6 < scatter / errors.mean() < 1.5  # 20 seeds: 16 %
+
+
+def test_values_below_zero_are_fitted():
+    curve = noisy(0)
+    assert np.sum(curve.temperature < 0) > 5
+    fit = fitted(GAS, curve, quick=True)
+    value, error = fit.value(A)
+    assert fit.converged and abs(value - GAS.value(A)) < 3 * error
+    gas = GAS.replace(dissipative_constant=value)
+    measurement = jaxgran.Measurement(GAS, curve, errors_measured=True)
+    slope = jax.grad(
+        lambda x: jaxgran.log_likelihood(gas.replace(dissipative_constant=x), measurement)
+    )(jnp.asarray(value))
+    assert abs(slope * error) < 0.1  # both are the same likelihood
+    with pytest.raises(ValueError, match="T below 0 is compared by kinetic theory only"):
+        fitted(GAS, curve, model=jaxgran.DSMC(50, replicas=2))
+
+
+def test_the_density_of_a_value_is_normalised():
+    error = 1.0
+    values = np.linspace(-8.0, 60.0, 200_001)
+    for computed in (0.1, 1.0, 4.0, 6.0, 8.0, 20.0):
+        log_computed = jnp.full(values.shape, np.log(computed))
+        errors = jnp.full(values.shape, error)
+        residuals = log_ratio(values, log_computed, errors)
+        change = log_density_change(values, log_computed, errors)
+        # The density of the residual times its slope; the unit is that of `log_density_change`.
+        unit = np.where(values > error, values, error) if computed < 10 else values
+        density = np.exp(-0.5 * (residuals * computed / error) ** 2 - 0.5 * change)
+        density *= computed / error / unit / np.sqrt(2 * np.pi)
+        whole = np.trapezoid(np.where(values > -7, density, 0.0), values)
+        assert whole == pytest.approx(1.0, abs=0.02), computed
+
+
+def test_ln_T_is_compared_far_from_zero_bit_for_bit():
+    values, errors = jnp.asarray([10.5, 200.0]), jnp.asarray([1.0, 0.0])
+    log_computed = jnp.log(jnp.asarray([10.4, 180.0]))
+    assert np.all(log_density_change(values, log_computed, errors) == 0)
+    assert np.all(
+        log_ratio(values, log_computed, errors) == jnp.log(values / jnp.exp(log_computed))
+    )
+
+
+@pytest.mark.slow
+def test_no_alternatives_of_a_curve_in_other_units():
+    curve = synthetic(GAS, num_points=8)
+    for factor in (300.0, 1e6):
+        scaled = jaxgran.CoolingCurve(
+            curve.times,
+            factor * curve.temperature,
+            temperature_error=factor * curve.temperature_error,
+        )
+        fit = fitted(GAS, scaled)
+        assert fit.grade == "not consistent" and not fit.alternatives
+        assert "check the units, the scale of T and T0" in str(fit.reasons)
+
+
+def test_a_curve_that_rises_is_not_explained_by_scatter():
+    curve = jaxgran.CoolingCurve([1.0, 2.0, 3.0, 4.0], [0.01, 0.011, 0.012, 0.013])
+    fit = fitted(GAS, curve, quick=True)
+    assert fit.grade == "not consistent" and "T rises from 0.01 to 0.013" in str(fit.reasons)
