@@ -298,7 +298,7 @@ def process(
     size = rates.shape[1]
     jacobian = (rates[1 : 2 * size : 2] - rates[2 : 2 * size + 1 : 2]).T / (2 * STEP)
     moments = squares[0]
-    if cumulants:
+    if cumulants and spins.correlation is not None:
         of_aa = (squares[5] + squares[6] - 2 * squares[0]) / step_of_A**2
         of_Ta = (squares[7] + squares[8] - squares[9] - squares[10]) / (8 * STEP * step_of_A)
         added = spins.kurtosis / inertia**2 * of_aa + 2 * spins.correlation / inertia * of_Ta

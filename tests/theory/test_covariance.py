@@ -188,7 +188,8 @@ def test_mean_rates_are_those_of_the_equations(name):
         kinds.append(covariance.wall_impacts(scene.walls, scene.surface, speed, d))
     A = 2 * spins.rotation / (1.0 if scene.surface is None else scene.surface.inertia)
     S = jnp.full(1, 2.0)
-    gains = sum(covariance.energy_moments(x, scene.surface, S, A, d)[0] for x in kinds)
+    each = [covariance.energy_moments(x, scene.surface, S, A, d)[0] for x in kinds]
+    gains = jnp.sum(jnp.stack(each), axis=0)
     spins = Spins.gaussian(jnp.asarray(ratio))
     without_drag = scene._replace(drag=None)
     elements = element_rates(without_drag, speed[0], spins, a2, d, gaussian_spins=True)
@@ -354,7 +355,7 @@ def test_single_precision():
     gas, double = GASES["rough"], GASES["rough"]
     times = taus(gas, 1, 10, 100)
     expected = THEORY.covariance(double, times, 250, rotation=True)
-    with jax.experimental.enable_x64(False):
+    with jax.enable_x64(False):
         single = jax.tree.map(lambda x: jnp.asarray(np.asarray(x, np.float32)), gas)
         found = THEORY.covariance(single, times.astype(np.float32), 250, rotation=True)
     assert found.dtype == jnp.float32
