@@ -244,7 +244,7 @@ def test_files_keep_permissions_and_follow_links(tmp_path):
 NAN_MODELS = [
     jaxgran.KineticTheory(),
     pytest.param(jaxgran.DSMC(20, replicas=2), marks=pytest.mark.slow),
-    pytest.param(jaxgran.HardSpheres(20), marks=pytest.mark.slow),
+    pytest.param(jaxgran.HardSpheres(20).sized_for(GAS), marks=pytest.mark.slow),
     pytest.param(jaxgran.SoftSpheres(20).sized_for(GAS), marks=pytest.mark.slow),
 ]
 

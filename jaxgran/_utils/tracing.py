@@ -26,9 +26,14 @@ def concrete_array(value: Any, dtype: DTypeLike | None = None) -> Array:
 
 def is_known(value: Any) -> bool:
     """Tell whether the value of a number is known, even if it carries a tangent."""
+    return not isinstance(known_part(value), Tracer)
+
+
+def known_part(value: Any) -> Any:
+    """Return a value without the tangents that it carries."""
     while isinstance(value, Tracer) and hasattr(value, "primal"):
         value = value.primal
-    return not isinstance(value, Tracer)
+    return value
 
 
 def in_compiled_code(*trees: Any) -> bool:

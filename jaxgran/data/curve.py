@@ -16,6 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxgran._utils.formatting import format_quantity, text_table
@@ -262,8 +263,8 @@ class CoolingCurve(eqx.Module):
         """
         known = {quantity.column: name for name, quantity in QUANTITIES.items()}
         columns = frame if {"t", "times"} & {*frame.columns} else frame.reset_index(names="times")
-        fields = {known.get(name, name): columns[name].to_numpy() for name in columns.columns}
-        if unknown := [str(name) for name in fields if name not in QUANTITIES]:
+        fields = {str(known.get(name, name)): columns[name].to_numpy() for name in columns.columns}
+        if unknown := [name for name in fields if name not in QUANTITIES]:
             raise ValueError(
                 f"the column {unknown[0]} is not of a curve: rename or drop it. Known are "
                 f"{', '.join(known)}, and the names of the fields of CoolingCurve"
@@ -419,7 +420,7 @@ def above_noise(curve: CoolingCurve) -> np.ndarray:
 def _is_known(values: Any) -> bool:
     """Return whether values are numbers, and neither traced nor None nor a placeholder."""
     is_array = isinstance(values, jax.Array | np.ndarray)
-    return is_array and not isinstance(values, jax.core.Tracer)
+    return is_array and not isinstance(values, Tracer)
 
 
 class Run(NamedTuple):

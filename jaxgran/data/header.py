@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from collections.abc import Mapping
 from math import pi
 from typing import Any
 
@@ -235,22 +236,21 @@ def elements_of_header(header: dict[str, str]) -> dict[str, Any]:
                 + (fitted if missing[0] in GUESSES else "")
             )
         values = header | {key: GUESSES[key] for key in GUESSES if header.get(key) == GUESS}
-        elements[name] = kind(
-            **{
-                fields[key]: header_sides(values)
-                if key == "container_side"
-                else files.header_number(values, key)
-                for key in given
-            }
-        )
+        arguments: dict[str, Any] = {}
+        for key in given:
+            if key == "container_side":
+                arguments[fields[key]] = header_sides(values)
+            else:
+                arguments[fields[key]] = files.header_number(values, key)
+        elements[name] = kind(**arguments)
     return elements
 
 
-def header_sides(header: dict[str, str]) -> float | list[float]:
+def header_sides(header: Mapping[str, Any]) -> float | list[float]:
     """Return the side of a cubic or square container, or its d sides, m."""
     sides = [
         files.header_number({"container_side": part.strip()}, "container_side")
-        for part in header["container_side"].split("x")
+        for part in str(header["container_side"]).split("x")
     ]
     return sides if len(sides) > 1 else sides[0]
 

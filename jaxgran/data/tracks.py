@@ -10,7 +10,7 @@ import numpy as np
 import scipy  # which imports scipy.stats at its first use
 from jaxtyping import Float, Int
 
-from jaxgran.data.curve import MIN_POINTS, CoolingCurve, check_values
+from jaxgran.data.curve import MIN_POINTS, CoolingCurve, check_values, from_arrays
 from jaxgran.data.files import header_count, header_number
 from jaxgran.data.particles import Frame, open_frames
 from jaxgran.scene.gas import Gas
@@ -239,7 +239,7 @@ def curve_of_tracks(
         "temperature_error": jnp.asarray(error * true / T),
     }
     check_values(fields, place="T between frames {} and the next".format)
-    curve = CoolingCurve(**fields)
+    curve = from_arrays(fields)
     header["T_from"] = f"T = <(u - <u>)^2>/d, u over neighbouring frames; {'; '.join(notes)}"
     for key in ("box_side", "frame_rate"):
         header.pop(key, None)
@@ -534,7 +534,7 @@ def curve_of_trajectory(
         raise ValueError("it has no frames")
     fields = {name: jnp.asarray([row[name] for row in rows if name in row]) for name in rows[0]}
     check_values(fields, place="frame {}".format)
-    curve = CoolingCurve(**fields)
+    curve = from_arrays(fields)
     if curve.times[0] == 0:
         header.setdefault("T0", repr(rows[0]["temperature"]))
     header["T_from"] = "T = <v^2>/d of the particles of each frame, in the frame at rest"

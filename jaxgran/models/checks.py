@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
 from jaxgran._utils import status
-from jaxgran._utils.tracing import any_traced, is_known
+from jaxgran._utils.tracing import any_traced, is_known, known_part
 from jaxgran.data.curve import CoolingCurve, Run
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.particles.run import MIN_BOX
@@ -299,6 +299,18 @@ def valid_where_traced(
     return gas, times, allowed
 
 
+def _allowed_gas(gas: Gas) -> Gas:
+    """Return a gas of known numbers, with those out of range replaced by ones in the range."""
+    gas = jax.tree.map(known_part, gas)
+    wrong = {}
+    for name, domain in gas.domains.items():
+        value = gas.value(name)
+        if not np.all(domain.contains(value)):
+            inside = domain.low if domain.low_allowed else domain.from_free(0.0)
+            wrong[name] = jnp.full_like(value, inside)
+    return gas.replace(**wrong)
+
+
 def unknown_curve(
     model: AbstractModel, gas: Gas, times: Float[Array, "times"], run: Run
 ) -> CoolingCurve:
@@ -307,6 +319,7 @@ def unknown_curve(
     It stands for a run with numbers that are known, and not allowed.
     """
     options = Run(run.key, save=run.save)
+    model = model.sized_for(_allowed_gas(gas))
     shapes = eqx.filter_eval_shape(
         lambda gas, times: model.simulate(gas, times, options), gas, times
     )
