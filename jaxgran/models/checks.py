@@ -14,11 +14,9 @@ from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced, is_known
 from jaxgran.data.curve import CoolingCurve, Run
 from jaxgran.models.base import AbstractModel, Limitation
-from jaxgran.particles.run import MIN_BOX
-from jaxgran.particles.setup import PACKING_LIMIT
 from jaxgran.scene.elements import VOLUME_TOLERANCE, container_volume_ratio
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.geometry import NODES
+from jaxgran.scene.geometry import MIN_BOX, NODES, PACKING_LIMIT
 from jaxgran.theory.averages import impact_moments
 from jaxgran.theory.equations import max_thermal_speed, softness_factor
 

@@ -57,16 +57,13 @@ from jaxgran.particles.setup import (
     relaxed_positions,
 )
 from jaxgran.particles.state import State, centred, copy_buffers
+from jaxgran.scene.geometry import MIN_BOX
 
 EQUILIBRATION_COLLISIONS = 10.0
 """Duration of the equilibration, in mean free times."""
 
 SETTLING_COLLISIONS = 2.0
 """Mean free times of equilibration after which the capacity of the run is sufficient."""
-
-MIN_BOX = 2.1
-"""Least side of a box in diameters; in a smaller one a sphere could touch another one and its image
-at once."""
 
 CHECKPOINT_SECONDS = 60.0
 """Time between checkpoints; one more is written when a run is interrupted."""

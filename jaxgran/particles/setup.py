@@ -20,10 +20,7 @@ from jaxgran.particles import neighbours
 from jaxgran.particles.snapshot import box_side
 from jaxgran.scene.elements import Walls
 from jaxgran.scene.gas import Gas
-
-PACKING_LIMIT = {2: 0.65, 3: 0.48}
-"""Largest packing fraction of a random start, which is a fluid, by dimension; hard disks and
-spheres freeze at slightly larger ones."""
+from jaxgran.scene.geometry import PACKING_LIMIT
 
 GAP = 1e-3
 """Smallest distance, in diameters, between the surfaces to which a pair is pushed apart."""
