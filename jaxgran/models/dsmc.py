@@ -34,9 +34,11 @@ class DSMC(AbstractParticleModel):
     The velocity distribution is exact, while kinetic theory has two Sonine terms. The model leaves
     out correlations, clustering and the duration of contacts.
 
-    A step is a fixed share of the current mean free time. Its error is of second order: a step
-    draws disjoint random pairs, and then pairs that share a particle with these, as often as
-    drawing one pair after the other would. Means over N particles have errors of O(1/N).
+    A step has a fixed number of candidate pairs, and takes the random time in which so many meet,
+    on average a fixed share of the current mean free time: T of a run scatters as in a gas of N
+    spheres. The error of a step is of second order: it draws disjoint random pairs, and then pairs
+    that share a particle with these, as often as drawing one pair after the other would. Means over
+    N particles have errors of O(1/N).
 
     Supports all elements of a scene but `jaxgran.Frictional`: rough spheres; walls, which all
     particles of the homogeneous gas hit with the same probability, more often the more energy the
@@ -58,8 +60,8 @@ class DSMC(AbstractParticleModel):
         num_particles: N, >= 2, on one device.
         replicas: number of independent gases that are simulated together; two or more give error
             bars.
-        step: collisions per particle in one step, in (0, 0.1]. A step has at least one pair, which
-            is 0.5/N; in a gas of some ten particles this is longer than requested.
+        step: mean number of collisions per particle in one step, in (0, 0.1]. A step has at least
+            one pair, which is 0.5/N; in a gas of some ten particles this is longer than requested.
 
     Raises:
         ValueError: for numbers out of range.

@@ -145,6 +145,19 @@ def test_each_of_a_few_particles_meets_the_others():
     assert abs(rate - (1 - 0.5 / n)) < 0.01
 
 
+def test_collisions_scatter_as_a_poisson_process():
+    # An elastic gas of constant T. A quarter of the candidates collide: with steps of fixed length
+    # the ratio would be .75.
+    n, replicas, taus = 101, 4000, np.array([0.02, 3.0])
+    (curve,) = curves_of(constant(1.0), taus, DSMC(n, replicas=replicas, step=0.01))
+    collisions = np.asarray(curve.replicas.collisions) * n / 2
+    mean, variance = collisions.mean(0), collisions.var(0, ddof=1)
+    error = np.sqrt((2 + 1 / mean) / replicas)  # of the variance of Poisson numbers
+    assert np.all(np.abs(variance / mean - 1) < 4 * error)
+    expected = n / 2 * taus * (1 - 0.5 / n)
+    assert np.all(np.abs(mean - expected) < 4 * np.sqrt(mean / replicas))
+
+
 ALL = {
     "surface": jaxgran.Rough(0.3, rotational_temperature=4e-3, friction=0.3),
     "container": jaxgran.Walls(0.05, restitution=0.8, tangential_restitution=0.2),

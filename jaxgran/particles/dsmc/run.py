@@ -21,7 +21,13 @@ from jaxgran.data.curve import Particles, Run
 from jaxgran.gradients.rule import Inputs, Outputs, with_tangents
 from jaxgran.gradients.tangents import ExchangeTangents
 from jaxgran.particles import observables, snapshot
-from jaxgran.particles.dsmc.collisions import DSMCDynamics, DSMCState, DSMCTangents, advance
+from jaxgran.particles.dsmc.collisions import (
+    DSMCDynamics,
+    DSMCState,
+    DSMCTangents,
+    advance,
+    waiting_time,
+)
 from jaxgran.particles.run import block_until_ready, compiled_for_host, compiling, run_through_times
 from jaxgran.particles.setup import maxwellian_velocities
 from jaxgran.particles.snapshot import Units
@@ -60,10 +66,12 @@ def initial_dsmc_state(
     elif directions is not None:
         tangents = DSMCTangents.initial(directions, replicas, v.dtype)
     zero = jnp.zeros(replicas, v.dtype)
+    duration = waiting_time(jax.random.fold_in(key, 1), dynamics.scheme.candidates, zero)
     return DSMCState(
         time=jnp.zeros((), v.dtype),
         clock=zero,
         clock_rest=zero,
+        duration=duration,
         temperature=zero + 1,
         particles=jnp.concatenate(parts, axis=-1),
         collisions=zero,
