@@ -15,6 +15,7 @@ import pytest
 
 import jaxgran
 from jaxgran import Run
+from jaxgran.gradients.rule import Records
 from jaxgran.particles import dynamics as moving
 from jaxgran.particles.run import block_until_ready, in_thread, run_through_times
 from tests.beads import glass_beads, spheres
@@ -95,10 +96,13 @@ class Standing:
 
 def test_a_run_that_stands_still_ends():
     state, records, fault = run_through_times(
-        Standing(), np.ones(1), lambda s, end: s, lambda s: {"temperature": jnp.ones(())}
+        Standing(),
+        np.ones(1),
+        lambda s, end: s,
+        lambda s: Records({"temperature": jnp.ones(())}, {}, {}),
     )
     assert "no longer advances" in jaxgran.explain_status(fault)
-    assert np.isnan(records["temperature"])
+    assert np.isnan(records.values["temperature"])
 
 
 @pytest.mark.slow

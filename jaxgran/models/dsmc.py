@@ -10,13 +10,14 @@ from jaxtyping import Array, Float
 
 from jaxgran._utils.validation import Domain, checked_float, checked_int, python_int
 from jaxgran.data.curve import Run
-from jaxgran.gradients.rule import Inputs, Outputs, differentiable
+from jaxgran.gradients.rule import Result, differentiable
 from jaxgran.models import checks
 from jaxgran.models.base import Limitation
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.models.particle_model import AbstractParticleModel
 from jaxgran.particles.dsmc.collisions import DSMCDynamics, Scheme
 from jaxgran.particles.dsmc.run import run_dsmc
+from jaxgran.particles.run import Inputs
 from jaxgran.particles.snapshot import Units
 from jaxgran.particles.state import transformed_times
 from jaxgran.scene.gas import Gas, reduced_scene
@@ -114,11 +115,11 @@ class DSMC(AbstractParticleModel):
         units = Units.of(gas, self.num_particles, length, gas.impact_speed)
         return Inputs(scene, reduced, None, run.key, units)
 
-    def differentiable(self, outputs: Callable[..., Outputs], run: Run) -> Callable[..., Outputs]:
+    def differentiable(self, outputs: Callable[..., Result], run: Run) -> Callable[..., Result]:
         """Return runs with derivatives in all numbers of a scene; none of them is a frequency."""
         return differentiable(outputs, lambda scene: scene, lambda scene: None)
 
-    def outputs(self, inputs: Inputs, directions: Any, dimension: int, run: Run) -> Outputs:
+    def outputs(self, inputs: Inputs, directions: Any, dimension: int, run: Run) -> Result:
         """Return the records of a run.
 
         It fails if too many pairs are faster than the ceiling of the collision rate.

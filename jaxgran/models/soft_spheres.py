@@ -46,6 +46,20 @@ BLOCK_LENGTHS = 1.2
 MAX_STORED_ENERGY = 0.5
 """Energy of the contacts of a start, over the kinetic energy, without a warning."""
 
+FRICTION_REFUSED = (
+    "the derivative of a run of SoftSpheres in the tangential_damping, friction or inertia of "
+    "contacts is not known. Hold them fixed with jax.lax.stop_gradient, take differences of runs, "
+    "or for a short run use SoftSpheres(projection=None)"
+)
+"""What is said of derivatives in the numbers of frictional contacts."""
+
+LENGTHS_REFUSED = (
+    "the derivative in the side of a container, or in the diameter or packing_fraction of the gas "
+    "in it, is not known. Hold them fixed with jax.lax.stop_gradient, take differences of runs, or "
+    "use KineticTheory()"
+)
+"""What is said of derivatives in lengths between walls."""
+
 INTEGRATION_ERROR = 0.001
 """Relative error of T by the time steps, with which eps is right to 1e-4."""
 
@@ -210,11 +224,17 @@ class SoftSpheres(AbstractSpheres):
         material = ReducedScene(ReducedContact.of(law, gas), surface, walls)
         return sphere_scene(gas, self.num_particles, material)
 
-    def non_differentiable(self, scene: SphereScene) -> Any:
-        """Return the lengths and the collision frequency between walls, otherwise nothing."""
-        if scene.container is None:
-            return ()
-        return scene.side, scene.container, scene.collision_frequency
+    def refused_derivatives(self, scene: SphereScene) -> dict[str, Any]:
+        """Return numbers of a scene in which the derivative of a run is not known, by a message.
+
+        These are the numbers of frictional contacts, and lengths between walls.
+        """
+        friction = [scene.material.surface and scene.material.surface._replace(ratio=None)]
+        lengths = []
+        if scene.container is not None:
+            friction.append(scene.material.walls.surface)
+            lengths = [scene.side, scene.container, scene.collision_frequency]
+        return {FRICTION_REFUSED: friction, LENGTHS_REFUSED: lengths}
 
     def dynamics(self, scene: SphereScene, plan: Plan) -> SoftDynamics:
         """Return the equations of motion of the spheres."""

@@ -18,14 +18,15 @@ from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced
 from jaxgran._utils.validation import POSITIVE, Domain, checked_float, checked_int
 from jaxgran.data.curve import DEFAULTS, CoolingCurve, Particles, Run
-from jaxgran.gradients.rule import Inputs, Outputs, by_differences, differentiable
+from jaxgran.gradients.differences import by_differences
+from jaxgran.gradients.rule import Result, differentiable
 from jaxgran.models import checks
 from jaxgran.models.error_model import ErrorModel, slope_bias_of_run
 from jaxgran.models.particle_model import AbstractParticleModel
 from jaxgran.particles import neighbours, snapshot
 from jaxgran.particles.capacity import Capacity, Neighbourhood, skin_for_pairs
 from jaxgran.particles.dynamics import AbstractDynamics
-from jaxgran.particles.run import Simulation, simulate_on_host, simulate_traced
+from jaxgran.particles.run import Inputs, Simulation, simulate_on_host, simulate_traced
 from jaxgran.particles.setup import check_inside, check_start, has_other_box, reduced_start
 from jaxgran.scene.gas import Gas, SphereScene
 
@@ -121,9 +122,9 @@ class AbstractSpheres(AbstractParticleModel):
         other_box = has_other_box(self.start, gas, self.num_particles)
         return late | other_box, fault | status.flag(status.BOX_MISMATCH, other_box)
 
-    def non_differentiable(self, scene: SphereScene) -> Any:
-        """Return the numbers of a scene in which the derivative of a run is not known."""
-        return ()
+    def refused_derivatives(self, scene: SphereScene) -> dict[str, Any]:
+        """Return numbers of a scene in which the derivative of a run is not known, by a message."""
+        return {}
 
     def check_fit(self, names: tuple[str, ...]) -> None:
         """Refuse plain derivatives, and the temperature and lengths of a given start."""
@@ -171,20 +172,25 @@ class AbstractSpheres(AbstractParticleModel):
             units=snapshot.Units.of(gas, self.num_particles, gas.diameter, speed),
         )
 
-    def differentiable(self, outputs: Callable[..., Outputs], run: Run) -> Callable[..., Outputs]:
+    def differentiable(self, outputs: Callable[..., Result], run: Run) -> Callable[..., Result]:
         """Return runs with projected derivatives, with differences of runs, or unchanged."""
         if not self.projected:
             return outputs
         if self.differences is not None:
             shifted = partial(outputs, run=Run(run.key, run.progress))  # these write no files
             outputs = by_differences(outputs, shifted, self.differences)
-        return differentiable(outputs, non_differentiable=self.non_differentiable)
+        return differentiable(
+            outputs,
+            material=lambda scene: scene.material,
+            frequency=lambda scene: scene.collision_frequency,
+            refused=self.refused_derivatives,
+        )
 
     def single_replica(self: S) -> S:
         """Return the model of one replica; the inputs of its run have its start."""
         return dataclasses.replace(self, replicas=1, start=None, plan=None)
 
-    def outputs(self, inputs: Inputs, directions: Any, dimension: int, run: Run) -> Outputs:
+    def outputs(self, inputs: Inputs, directions: Any, dimension: int, run: Run) -> Result:
         """Run all replicas in one array, from the host unless a number of the inputs is traced."""
         plan = self._known_plan(inputs.scene, dimension)
         side = inputs.scene.filled_side

@@ -17,6 +17,7 @@ from equinox import AbstractVar
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from jaxgran._utils import status
+from jaxgran.gradients.rule import Records
 from jaxgran.particles import neighbours
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.neighbours import ListedPairs, Pairs
@@ -97,8 +98,8 @@ class AbstractDynamics(eqx.Module):
         """
 
     @abstractmethod
-    def observe(self, state: State) -> dict[str, Array]:
-        """Return the records of a state, and with tangents those for `jaxgran.gradients.rule`."""
+    def observe(self, state: State) -> Records:
+        """Return the records of a state."""
 
     @abstractmethod
     def elastic(self) -> "AbstractDynamics":

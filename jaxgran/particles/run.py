@@ -37,7 +37,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray
 from tqdm import tqdm
 
 from jaxgran._utils import status
@@ -46,7 +46,7 @@ from jaxgran.data import checkpoint
 from jaxgran.data.checkpoint import describe_run
 from jaxgran.data.curve import Particles, Run
 from jaxgran.data.particles import Sphere, Trajectory, file_of_replica
-from jaxgran.gradients.rule import Inputs, Outputs
+from jaxgran.gradients.rule import Records, Result
 from jaxgran.particles import neighbours, snapshot
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import MAX_STALLED, AbstractDynamics, run_segments
@@ -82,6 +82,24 @@ times as long as in one array."""
 Devices = tuple[Any, ...]
 
 T = TypeVar("T")
+
+
+class Inputs(NamedTuple):
+    """Arguments that determine a run, in reduced units.
+
+    Attributes:
+        scene: the gas; it has a collision_frequency.
+        times: t at which to record.
+        start: positions and velocities given by the user; None for random ones.
+        key: of the random numbers; None for the default.
+        units: of the saved particle data, whose derivatives are not known.
+    """
+
+    scene: Any
+    times: Float[Array, "times"]
+    start: tuple[Array, Array] | None
+    key: PRNGKeyArray | None
+    units: Any = None
 
 
 class Simulation(NamedTuple):
@@ -131,11 +149,10 @@ class Simulation(NamedTuple):
         velocity = self.inputs.start[1]
         return velocity - centred(velocity, self.dynamics.replicas).reshape(velocity.shape)
 
-    def outputs(self, state: State, records: dict[str, Array], fault: ArrayLike) -> Outputs:
+    def result(self, state: State, records: Records, fault: ArrayLike) -> Result:
         """Return the results of a run, in the frame in which the start was given."""
-        position, velocity, spin = self.to_lab_frame(state, self.inputs.times[-1])
-        fault = jnp.asarray(fault, jnp.int32)
-        return Outputs(position, velocity, records, fault, spin)
+        last = self.to_lab_frame(state, self.inputs.times[-1])
+        return Result(records, last, jnp.asarray(fault, jnp.int32))
 
     def to_lab_frame(self, state: State, time: Array) -> tuple[Array, Array, Array | None]:
         """Return wrapped positions, velocities and spins in the frame of the given start."""
@@ -144,12 +161,12 @@ class Simulation(NamedTuple):
         inside = neighbours.wrap(self.dynamics.scene.side, state.position + drift * time)
         return inside, velocity, spin
 
-    def observe(self, state: State) -> dict[str, Array]:
+    def observe(self, state: State) -> Records:
         """Return the records of a state, with those of the user's function."""
         records = self.dynamics.observe(state)
         if self.save is None:
             return records
-        return records | snapshot.saved_records(self.save, self.particles(state))
+        return records._replace(saved=snapshot.saved(self.save, self.particles(state)))
 
     def particles(self, state: State) -> Particles:
         """Return the particles of a state in SI."""
@@ -212,7 +229,7 @@ class Simulation(NamedTuple):
 
 
 @eqx.filter_jit
-def simulate_traced(sim: Simulation) -> Outputs:
+def simulate_traced(sim: Simulation) -> Result:
     """Equilibrate and cool inside JAX transformations, with records at the times of the inputs."""
     dynamics, inputs = sim.dynamics, sim.inputs
     engine = neighbours.choose_engine(sim.engine, dynamics.capacity.lookahead, traced=True)
@@ -241,10 +258,10 @@ def simulate_traced(sim: Simulation) -> Outputs:
     carry = sim.cooling_state(state), fault
     (state, fault), records = jax.lax.scan(record_at, carry, (ends, least))
     records = jax.tree.map(lambda x: x[1:], records)
-    return sim.outputs(state, records, fault)
+    return sim.result(state, records, fault)
 
 
-def simulate_on_host(sim: Simulation, run: Run, settings: dict[str, Any]) -> Outputs:
+def simulate_on_host(sim: Simulation, run: Run, settings: dict[str, Any]) -> Result:
     """Equilibrate and cool from the host, and enlarge arrays where they are too short.
 
     Args:
@@ -282,7 +299,7 @@ def simulate_on_host(sim: Simulation, run: Run, settings: dict[str, Any]) -> Out
         write=write,
         fault=fault,
     )
-    return sim.outputs(state, jax.tree.map(jnp.asarray, records), fault)
+    return sim.result(state, jax.tree.map(jnp.asarray, records), fault)
 
 
 def _equilibrate(sim: Simulation, state: State, engine: str, progress: bool) -> tuple[State, int]:
@@ -364,16 +381,16 @@ def run_through_times(
     state: Any,
     times: np.ndarray,
     advance: Callable[[Any, float], Any],
-    observe: Callable[[Any], dict[str, jax.Array]],
+    observe: Callable[[Any], Records],
     *,
     write: Callable[[int, Any], None] = lambda k, state: None,
-    shown: Callable[[Any], dict[str, jax.Array]] | None = None,
+    shown: Callable[[Any], Records] | None = None,
     scene: dict[str, str] | None = None,
     progress: bool = True,
     label: str | None = None,
     path: str | Path | None = None,
     fault: int = status.OK,
-) -> tuple[Any, dict[str, np.ndarray], int]:
+) -> tuple[Any, Records, int]:
     """Advance a state through all times and record it at each.
 
     Args:
@@ -431,7 +448,7 @@ def run_through_times(
                         raise RunFailure(status.STALLED.bit)
                     bar.update(float(state.time) - bar.n)
                     if not bar.disable:
-                        ratio = float(np.mean((shown or observe)(state)["temperature"]))
+                        ratio = float(np.mean((shown or observe)(state).values["temperature"]))
                         bar.set_postfix_str(f"T/T_0 = {ratio:.3g}", refresh=False)
                     if time.monotonic() - last_save > CHECKPOINT_SECONDS:
                         save()
@@ -622,7 +639,7 @@ def run_replicas(
     return [by_device[k % len(devices)][k // len(devices)] for k in range(replicas)]
 
 
-def join_outputs(runs: list[Outputs]) -> Outputs:
+def join_results(runs: list[Result]) -> Result:
     """Join the results of runs with one replica each to those of one run.
 
     Particles are joined along the first axis. Records have the shape (times, replicas, ...); in
@@ -632,13 +649,12 @@ def join_outputs(runs: list[Outputs]) -> Outputs:
     def joined(axis: int, *parts: Array) -> Array:
         return concrete_array(np.concatenate([np.asarray(part) for part in parts], axis))
 
-    records = {
-        name: jax.tree.map(
-            partial(joined, -1 if name.endswith(".along") else 1),
-            *(out.records[name] for out in runs),
-        )
-        for name in runs[0].records
-    }
+    records = [each.records for each in runs]
+    tangents = jax.tree.map(partial(joined, -1), *(each.tangents for each in records))
+    others = (each._replace(tangents={}) for each in records)
     fault = concrete_array(np.bitwise_or.reduce([np.asarray(out.status) for out in runs]))
-    none = (out._replace(records=None, status=None) for out in runs)
-    return jax.tree.map(partial(joined, 0), *none)._replace(records=records, status=fault)
+    return Result(
+        records=jax.tree.map(partial(joined, 1), *others)._replace(tangents=tangents),
+        particles=jax.tree.map(partial(joined, 0), *(each.particles for each in runs)),
+        status=fault,
+    )

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
-from jaxgran.gradients.tangents import ContactTangents, ExchangeTangents, ImpactTangents
+from jaxgran.gradients.tangents import ExchangeTangents
 from jaxgran.particles import observables
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.gas import ReducedDrag, ReducedRough, SphereScene
@@ -110,10 +110,10 @@ def fastest(velocity: Float[Array, "n d"], replicas: int) -> Float[Array, "repli
     return jnp.sqrt(jnp.max(jnp.sum(velocity * velocity, -1).reshape(replicas, -1), axis=-1))
 
 
-def common_records(
+def common_values(
     state: State, scene: SphereScene, replicas: int
-) -> tuple[dict[str, Array], Float[Array, "replicas N d"], Float[Array, "replicas N d"]]:
-    """Return the records that soft and hard spheres share, displacements and velocities.
+) -> tuple[dict[str, Array], Float[Array, "replicas N d"]]:
+    """Return the records that soft and hard spheres share, and velocities.
 
     They are relative to the centre of mass, between walls relative to the walls. Walls bound
     displacements, and there are no periodic waves between them: these records are left out.
@@ -133,44 +133,7 @@ def common_records(
         flow_share = jax.vmap(partial(observables.flow_share, side=scene.side))
         values["displacement"] = observables.mean_square_displacement(displacement)
         values["flow_share"] = flow_share(state.position.reshape(velocity.shape), velocity)
-    return values, displacement, velocity
-
-
-def derivatives_of_records(
-    values: dict[str, Array],
-    displacement: Float[Array, "replicas N d"],
-    velocity: Float[Array, "replicas N d"],
-    tangents: ContactTangents | ImpactTangents,
-    cooling_rate: Float[Array, "replicas"],
-) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Return derivatives of `common_records` for `jaxgran.gradients.rule.with_tangents`.
-
-    As a function of time ``<v(0).v>`` decays at 2/d of the collision rate.
-
-    Args:
-        values, displacement, velocity: results of `common_records`.
-        tangents: of the state.
-        cooling_rate: ``-d ln T/dt``.
-
-    Returns:
-        The derivatives along the directions at a fixed place, and those with respect to time.
-    """
-    c, d, paths = tangents.log_temperature, velocity.shape[-1], tangents.paths
-    T, C = values["temperature"], values["velocity_correlation"]
-    collision_rate = tangents.rates.collision(T)
-    along = {
-        "temperature": c * T[None],
-        "velocity_correlation": (0.5 * c + paths.correlation_along) * C[None],
-    }
-    if "displacement" in values:
-        along["displacement"] = paths.log_displacement * values["displacement"][None]
-    rates = {
-        "temperature": -cooling_rate * T,
-        "displacement": 2 * jnp.mean(jnp.sum(displacement * velocity, -1), axis=1),
-        "velocity_correlation": -2 / d * collision_rate * C,
-        "collisions": collision_rate,
-    }
-    return along, rates
+    return values, velocity
 
 
 class DragDecay(NamedTuple):
@@ -214,21 +177,26 @@ def exchange_derivatives(
     values: dict[str, Array],
     tangents: ExchangeTangents,
     drag: ReducedDrag | None,
-    drag_along: Any,
+    drag_directions: Any,
     time: Float[Array, ""],
     size: tuple[int, int],
-) -> dict[str, Array]:
-    """Return derivatives of T, T_rot and collisions for `jaxgran.gradients.rule.differentiable`.
+) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Return derivatives of T, T_rot and collisions.
 
     Args:
-        values: the records, some of which are these three.
+        values: the records, some of which are these.
         tangents: of the energies that the particles exchange.
         drag: rates of drag; None without drag.
-        drag_along: directions in these rates, like `drag`.
+        drag_directions: directions in these rates, like `drag`.
         time: transformed time of the records.
         size: N and d.
+
+    Returns:
+        The derivatives in time, and along the directions, as in `jaxgran.gradients.rule.Records`.
     """
-    (n, d), decay, decay_along = size, jnp.zeros(2), jnp.zeros((1, 2))
+    n, d = size
+    decay = jnp.zeros(2)
+    decay_slopes = jnp.zeros((1, 2))
     if drag is not None:
 
         def logarithms(drag: ReducedDrag) -> Array:
@@ -236,16 +204,25 @@ def exchange_derivatives(
             return jnp.log(jnp.stack([left.velocity, left.true_spin]))
 
         decay, linear = jax.linearize(logarithms, drag)
-        decay_along = jax.vmap(linear)(drag_along)
-    along = {"collisions": 2 / n * tangents.collisions}
+        decay_slopes = jax.vmap(linear)(drag_directions)
+    slopes = {"collisions": 2 / n * tangents.collisions}
     for k, name in enumerate(("temperature", "rotational_temperature")):
         if name in values:
             energy = n * (d, NUM_SPIN_COMPONENTS[d])[k] / 2
             moved = jnp.exp(2 * decay[k]) * tangents.energies[:, k] / energy
-            along[name] = moved + 2 * decay_along[:, k, None] * values[name][None]
-    elapsed = jnp.where(time > 0, time, 1.0)  # the last direction is that of time
-    rates = {f"{name}.rate": x[-1] / elapsed for name, x in along.items()}
-    return rates | {f"{name}.along": x[:-1] for name, x in along.items()}
+            slopes[name] = moved + 2 * decay_slopes[:, k, None] * values[name][None]
+    elapsed = jnp.where(time > 0, time, 1.0)  # the last direction is the direction of time
+    rates = {name: x[-1] / elapsed for name, x in slopes.items()}
+    return rates, {name: x[:-1] for name, x in slopes.items()}
+
+
+def with_dissipated_energy(slopes: dict[str, Array], dimension: int) -> dict[str, Array]:
+    """Return derivatives with the derivative of the dissipated energy, by the energy balance."""
+    inside = 0.5 * dimension * slopes["temperature"] + slopes.get("elastic_energy", 0.0)
+    if "rotational_temperature" in slopes:
+        components = NUM_SPIN_COMPONENTS[dimension]
+        inside = inside + 0.5 * components * slopes["rotational_temperature"]
+    return slopes | {"dissipated_energy": -inside}
 
 
 MAX_KICK = 0.05

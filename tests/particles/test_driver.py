@@ -9,6 +9,7 @@ import pytest
 from tqdm import tqdm
 
 import jaxgran
+from jaxgran.gradients.rule import Records
 from jaxgran.particles import run
 from jaxgran.particles.run import RunFailure, compiling, run_through_times
 from tests.beads import assert_same, glass_beads
@@ -35,7 +36,8 @@ def advance(state, until):
 
 
 def observe(state):
-    return {"temperature": state.x**2, "total": jnp.sum(state.x), "count": state.count}
+    values = {"temperature": state.x**2, "total": jnp.sum(state.x), "count": state.count}
+    return Records(values, {}, {})
 
 
 class Calls:
@@ -139,4 +141,5 @@ def test_a_failure_leaves_nan_and_a_status():
 
     state, records, fault = run_through_times(start(), TIMES, fails, observe, progress=False)
     assert "not a finite number" in jaxgran.explain_status(fault) and state.time == 1.0
-    assert np.all(np.isfinite(records["total"][:3])) and np.all(np.isnan(records["total"][3:]))
+    total = records.values["total"]
+    assert np.all(np.isfinite(total[:3])) and np.all(np.isnan(total[3:]))

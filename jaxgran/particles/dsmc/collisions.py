@@ -30,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt, UInt32
 
-from jaxgran.gradients.tangents import ExchangeTangents, PathTangents
+from jaxgran.gradients.tangents import ExchangeTangents
 from jaxgran.particles.state import (
     MAX_KICK,
     DragDecay,
@@ -115,31 +115,6 @@ def waiting_time(
     return jnp.maximum(root, 1e-3) ** 3
 
 
-class DSMCTangents(NamedTuple):
-    """Tangents at a fixed scaled time s, ``ds = sqrt(T/T_0) dt``, along p directions in the law.
-
-    The tangent of the velocities is c v / 2. The rate of velocity relaxation, which `PathTangents`
-    takes, is measured on the collisions.
-
-    Attributes:
-        directions: in the scene, stacked along a first axis of each leaf.
-        log_temperature: c = d ln T.
-        clock: tangent of the time.
-        paths: tangents of the paths of the particles.
-    """
-
-    directions: ReducedScene
-    log_temperature: Float[Array, "p *replicas"]
-    clock: Float[Array, "p *replicas"]
-    paths: PathTangents
-
-    @classmethod
-    def initial(cls, directions: ReducedScene, replicas: int, dtype: Any) -> "DSMCTangents":
-        """Return the tangents at t = 0."""
-        paths = PathTangents.initial(directions, replicas, dtype)
-        return cls(directions, paths.correlation_along, paths.correlation_along, paths)
-
-
 class DSMCState(NamedTuple):
     """State of R replicas of N particles. Units: the impact speed sqrt(2 T_0) and the path length.
 
@@ -154,7 +129,7 @@ class DSMCState(NamedTuple):
         collisions: number of pairs that collided.
         missed: number of collisions missed because of the `CEILING`.
         steps: number of steps.
-        tangents: `DSMCTangents`, or `ExchangeTangents` of a scene with elements; None without them.
+        tangents: of the energies, see `ExchangeTangents`; None without them.
     """
 
     time: Float[Array, ""]
@@ -211,9 +186,6 @@ class Outcome(NamedTuple):
         num: number of collisions.
         missed: number of collisions missed because of the ceiling of the collision rate.
         loss: decrease of sum v^2.
-        relaxation: ``sum (1 + eps)^2 (g.n)^2 / 4``, by which D/sqrt(T) decays.
-        along: tangents of -loss and of relaxation along the directions in the law.
-        along_speed: their tangents in the logarithm of all speeds.
         rotational_gain: increase of q sum s^2 of rough spheres.
         spin_change: change of the spins of both particles of each pair.
     """
@@ -222,9 +194,6 @@ class Outcome(NamedTuple):
     num: Float[Array, ""]
     missed: Float[Array, ""]
     loss: Float[Array, ""]
-    relaxation: Float[Array, ""]
-    along: Float[Array, "2 p"]
-    along_speed: Float[Array, "..."]  # (2,)
     rotational_gain: Float[Array, ""] | float
     spin_change: Float[Array, "pairs spins"]
 
@@ -235,7 +204,6 @@ def collide(
     ceiling: Float[Array, ""],
     share: Float[Array, ""],
     scene: ReducedScene,
-    directions: ReducedScene | None,
     spin: Float[Array, "pairs spins"],
     drag_factor: Float[Array, ""] | float = 1.0,
 ) -> Outcome:
@@ -247,7 +215,6 @@ def collide(
         ceiling: |g| at which a candidate collides with probability 1 in a whole step.
         share: fraction of the step to be done.
         scene: in reduced units.
-        directions: of the tangents; None for no tangents.
         spin: s_i + s_j; smooth spheres have no components.
         drag_factor: ratio of physical velocities to these.
     """
@@ -265,18 +232,7 @@ def collide(
     cosine = jnp.sqrt(jnp.where(in_disk, 1 - sine_square, 1.0))
     sideways = _perpendicular(axis)
     normal_speed = jnp.where(hit, speed * cosine, ceiling)
-    at_impact, zero = normal_speed * drag_factor, jnp.zeros((), dtype)
-
-    def restitution(law, log_scale):
-        return law.restitution(at_impact * jnp.exp(log_scale))
-
-    if directions is None:
-        eps, along, along_speed = restitution(scene.law, zero), jnp.zeros((2, 0), dtype), zero
-    else:
-        eps, pull = jax.vjp(restitution, scene.law, zero)
-        weights = [jnp.where(hit, x * at_impact**2, 0.0) for x in (eps, (1 + eps) / 2)]
-        in_law, along_speed = jax.vmap(pull)(jnp.stack(weights))
-        along = jax.vmap(slopes_along, (0, None))(in_law, directions.law)
+    eps = scene.law.restitution(normal_speed * drag_factor)
     square = jnp.where(hit, normal_speed**2, 0.0)
     push = jnp.where(hit, (1 + eps) / 2 * normal_speed, 0.0)
     normal = [
@@ -288,9 +244,6 @@ def collide(
         num=jnp.sum(hit, dtype=dtype),
         missed=share * jnp.sum(jnp.where(in_disk, jnp.maximum(speed / ceiling - 1, 0.0), 0.0)),
         loss=jnp.sum((1 - eps**2) / 2 * square),
-        relaxation=jnp.sum((1 + eps) ** 2 / 4 * square),
-        along=along,
-        along_speed=along_speed,
         rotational_gain=0.0,
         spin_change=spin,
     )
@@ -325,7 +278,7 @@ def _perpendicular(axis: list[Float[Array, "pairs"]]) -> list[list[Float[Array, 
 def slopes_along(gradient: Any, directions: Any) -> Float[Array, "p"]:
     """Return the derivatives along some directions, from the derivatives in all numbers."""
     products = jax.tree.map(lambda g, x: jnp.tensordot(x, g, g.ndim), gradient, directions)
-    return sum(jax.tree.leaves(products), start=jnp.zeros(()))  # a law may have no floats
+    return sum(jax.tree.leaves(products), start=jnp.zeros(1))  # a law may have no floats
 
 
 FASTEST_SPEED = 3.5
@@ -398,10 +351,19 @@ step; None without a drive or walls."""
 CandidatePairs = tuple[Array, Array, Array]
 """Candidate pairs of a step: relative velocities, sums of the spins in the state, random bits."""
 
-EnergyGains = tuple[Float[Array, "2"], Float[Array, "changes 2"]]
-"""Gains of sum v^2 and of q sum s^2 of the spins in the state, and their tangents: along directions
-in the scene, of which the last is that of time, and in the logarithms of all velocities and of all
-spins."""
+
+class EnergyGains(NamedTuple):
+    """Gains of sum v^2 and, of spheres that rotate, of q sum s^2, and their tangents.
+
+    Attributes:
+        values: of both energies, or of one.
+        by_direction: along directions in the scene, of which the last is the direction of time.
+        by_scale: in the logarithms of all velocities and of all spins.
+    """
+
+    values: Float[Array, "energies"]
+    by_direction: Float[Array, "directions energies"]
+    by_scale: Float[Array, "energies energies"]
 
 
 class DSMCDynamics(eqx.Module):
@@ -524,7 +486,7 @@ class DSMCDynamics(eqx.Module):
         state within a step is as accurate as at its end. `largest` are the largest numbers of
         subsets of all replicas.
         """
-        scheme, before, tangents = self.scheme, state, state.tangents
+        scheme, before = self.scheme, state
         key = jax.random.fold_in(key, state.steps)
         dt = share * self.full_step(state)
         kicks, walls = zip(subsets, largest, strict=True)
@@ -551,24 +513,10 @@ class DSMCDynamics(eqx.Module):
             steps=state.steps + (share > 0).astype(state.steps.dtype),
         )
         new = kick(new, place=1)
-        if isinstance(tangents, ExchangeTangents):
-            ceiling = CEILING * jnp.sqrt(state.temperature)
-            tangents = self._exchange_tangents(
-                before, ceiling, chance, dt, pairs, wall_gains, sums.num
-            )
-        elif tangents is not None:
-            # The tangent of the velocities is (c/2) v, and the law contributes at every collision.
-            c, after = tangents.log_temperature, energy * temperature
-            along = sums.along + sums.along_speed[:, None] * (c / 2)[None]
-            gain, fading = along / after
-            # In the units of a run T is half of T/T_0.
-            thermal_time = share * state.duration * scheme.scaled_step / sqrt(2)
-            relaxed = sums.relaxation / after
-            tangents = tangents._replace(
-                log_temperature=c + gain,
-                clock=tangents.clock - c / 2 * dt,
-                paths=tangents.paths.after(thermal_time, relaxed, fading, scheme.dimension),
-            )
+        if before.tangents is None:
+            return new
+        ceiling = CEILING * jnp.sqrt(state.temperature)
+        tangents = self._tangents_after(before, ceiling, chance, dt, pairs, wall_gains, sums.num)
         return new._replace(tangents=tangents)
 
     def _kick(
@@ -619,13 +567,11 @@ class DSMCDynamics(eqx.Module):
         middle = state.clock + dt / 2
         decay = self.drag_decay(middle)
         v, spin, spin_factor = old[:, :d], old[:, 2 * d :] * decay.spin, decay.spin
-        scaled = isinstance(state.tangents, DSMCTangents)
         rule = partial(
             collide,
             ceiling=CEILING * jnp.sqrt(state.temperature),
             share=chance,
             scene=self.scene,
-            directions=state.tangents.directions if scaled else None,
             drag_factor=decay.velocity,
         )
         firsts = v[:first] - v[first : 2 * first]
@@ -696,11 +642,11 @@ class DSMCDynamics(eqx.Module):
                 # derivative.
                 weight = frequency * ratio
                 weight = (weight / jax.lax.stop_gradient(weight))[:, None]
-                inertia = 0.0 if surface is None else surface.inertia
-                loss = -jnp.sum(weight * kick * (2 * velocity + kick))
-                gain = inertia * jnp.sum(weight * spin_change * (2 * spin + spin_change))
-                gains = jnp.stack([-loss, gain / decay.spin**2])
-                return velocity + kick, spin + spin_change, gains
+                gains = [jnp.sum(weight * kick * (2 * velocity + kick))]
+                if surface is not None:
+                    gain = jnp.sum(weight * spin_change * (2 * spin + spin_change))
+                    gains.append(surface.inertia * gain / decay.spin**2)
+                return velocity + kick, spin + spin_change, jnp.stack(gains)
 
             def gained(dynamics: DSMCDynamics, *options: Any) -> Array:
                 return hit(dynamics.scene, *options)[2]
@@ -708,7 +654,7 @@ class DSMCDynamics(eqx.Module):
             decay = self.drag_decay(middle)
             velocity, spin, gain = hit(self.scene, decay, one, decay.spin)
             gains = None
-            if isinstance(state.tangents, ExchangeTangents):
+            if state.tangents is not None:
                 gains = self._energy_gains(gained, middle, state.tangents.directions)
             after = [velocity, rows[:, d : 2 * d], spin / decay.spin]
             return jnp.concatenate(after, axis=-1), (-gain[0], gains)
@@ -720,7 +666,7 @@ class DSMCDynamics(eqx.Module):
         particles, (loss, gains) = change_subsets(particles, first, drawn, largest, hit_rows, zero)
         return particles, loss, gains
 
-    def _exchange_tangents(
+    def _tangents_after(
         self,
         before: DSMCState,
         ceiling: Float[Array, ""],
@@ -732,39 +678,42 @@ class DSMCDynamics(eqx.Module):
     ) -> ExchangeTangents:
         """Return the tangents after a step; see `collide` for its ceiling and share."""
         d, start, directions = self.scheme.dimension, before.clock, before.tangents.directions
+        surface = self.scene.surface
+        num_energies = 1 if surface is None else 2
 
         def by_collisions(
             dynamics: DSMCDynamics, decay: DragDecay, faster: Array, turning: Array
         ) -> Array:
-            scene, total = dynamics.scene, jnp.zeros(2, ds.dtype)
+            scene, total = dynamics.scene, jnp.zeros(num_energies, ds.dtype)
             for relative, spins, bits in candidates:
                 relative, spins = relative * faster, spins * turning
-                outcome = collide(
-                    relative, bits, ceiling, share, scene, None, spins, decay.velocity
-                )
-                gain = outcome.rotational_gain / decay.spin**2
-                total = total + jnp.stack([-outcome.loss, gain])
+                outcome = collide(relative, bits, ceiling, share, scene, spins, decay.velocity)
+                gained = [-outcome.loss, outcome.rotational_gain / decay.spin**2]
+                total = total + jnp.stack(gained[:num_energies])
             return total
 
         def by_drive(dynamics: DSMCDynamics, *_: Any) -> Array:
             growth = sum(dynamics.kick_growth(start, ds, place) for place in (0.0, 1.0))
-            return jnp.stack([self.scheme.num_particles * d / 2 * growth, jnp.zeros_like(ds)])
+            heat = self.scheme.num_particles * d / 2 * growth
+            return jnp.zeros(num_energies, ds.dtype).at[0].set(heat)
 
-        gains, along = self._energy_gains(by_collisions, start + ds / 2, directions)
+        sources = [self._energy_gains(by_collisions, start + ds / 2, directions)]
         if self.scene.drive is not None:
-            kicks, along_kicks = self._energy_gains(by_drive, start + ds / 2, directions)
+            kicks = self._energy_gains(by_drive, start + ds / 2, directions)
             # The rate of impacts depends on the speeds; kicks do not depend on them.
-            gains, along = gains + kicks, along + along_kicks.at[-2].add(-kicks)
+            held = kicks.by_scale.at[0].add(-kicks.values)
+            sources.append(kicks._replace(by_scale=held))
         if wall_gains is not None:
-            gains, along = gains + wall_gains[0], along + wall_gains[1]
-        v, s = before.particles[:, :d], before.particles[:, 2 * d :]
-        inertia = 0.0 if self.scene.surface is None else self.scene.surface.inertia
-        energies = jnp.stack([jnp.sum(v**2), inertia * jnp.sum(s**2)])
-        return before.tangents.after(energies, gains, along, collisions)
+            sources.append(wall_gains)
+        gains = jax.tree.map(lambda *each: sum(each[1:], start=each[0]), *sources)
+        energies = [jnp.sum(before.particles[:, :d] ** 2)]
+        if surface is not None:
+            energies.append(surface.inertia * jnp.sum(before.particles[:, 2 * d :] ** 2))
+        return before.tangents.after(jnp.stack(energies), *gains, collisions)
 
     def _energy_gains(
         self,
-        gained: Callable[..., Float[Array, "2"]],
+        gained: Callable[..., Float[Array, "energies"]],
         middle: Float[Array, ""],
         directions: ReducedScene,
     ) -> EnergyGains:
@@ -772,24 +721,26 @@ class DSMCDynamics(eqx.Module):
 
         It is a function of the dynamics, the decay by drag, and factors of velocities and spins.
         """
+        num_energies = 1 if self.scene.surface is None else 2
 
-        def gains(scene: ReducedScene, velocity: Array, spin: Array) -> Array:
+        def gains(scene: ReducedScene, log_scales: Float[Array, "energies"]) -> Array:
             dynamics = DSMCDynamics(scene, self.scheme)
             decay = dynamics.drag_decay(middle)
-            faster, turning = jnp.exp(velocity), decay.spin * jnp.exp(spin)
+            faster, turning = jnp.exp(log_scales[0]), decay.spin
             if scene.surface is not None:  # at a given energy a larger inertia has smaller spins
                 inertia = scene.surface.inertia
-                turning = turning * jnp.sqrt(jax.lax.stop_gradient(inertia) / inertia)
+                smaller = jnp.sqrt(jax.lax.stop_gradient(inertia) / inertia)
+                turning = turning * jnp.exp(log_scales[1]) * smaller
             return gained(dynamics, decay, faster, turning)
 
-        zero = jnp.zeros_like(middle)
-        values, pull = jax.vjp(gains, self.scene, zero, zero)
+        values, pull = jax.vjp(gains, self.scene, jnp.zeros(num_energies, middle.dtype))
 
-        def row(weights):
-            in_scene, *in_motion = pull(weights)
-            return jnp.concatenate([slopes_along(in_scene, directions), jnp.stack(in_motion)])
+        def slopes(weights: Array) -> tuple[Array, Array]:
+            in_scene, in_scales = pull(weights)
+            return slopes_along(in_scene, directions), in_scales
 
-        return values, jax.vmap(row)(jnp.eye(2, dtype=zero.dtype)).T
+        by_direction, by_scale = jax.vmap(slopes)(jnp.eye(num_energies, dtype=middle.dtype))
+        return EnergyGains(values, by_direction.T, by_scale.T)
 
 
 def advance(

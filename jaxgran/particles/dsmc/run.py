@@ -18,17 +18,22 @@ from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced
 from jaxgran.data.checkpoint import describe_run
 from jaxgran.data.curve import Particles, Run
-from jaxgran.gradients.rule import Inputs, Outputs, with_tangents
+from jaxgran.gradients.rule import Records, Result
 from jaxgran.gradients.tangents import ExchangeTangents
 from jaxgran.particles import observables, snapshot
 from jaxgran.particles.dsmc.collisions import (
     DSMCDynamics,
     DSMCState,
-    DSMCTangents,
     advance,
     waiting_time,
 )
-from jaxgran.particles.run import block_until_ready, compiled_for_host, compiling, run_through_times
+from jaxgran.particles.run import (
+    Inputs,
+    block_until_ready,
+    compiled_for_host,
+    compiling,
+    run_through_times,
+)
 from jaxgran.particles.setup import maxwellian_velocities
 from jaxgran.particles.snapshot import Units
 from jaxgran.particles.state import (
@@ -40,8 +45,6 @@ from jaxgran.particles.state import (
 )
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.gas import ReducedScene
-from jaxgran.scene.laws import ReducedLaw
-from jaxgran.theory import averages
 
 
 @partial(jax.jit, static_argnames="replicas")
@@ -61,10 +64,8 @@ def initial_dsmc_state(
         key = jax.random.fold_in(key, 0)
         mean_square = (scene.surface.ratio / (2 * scene.surface.inertia)).astype(v.dtype)
         parts.append(maxwellian_spins(key, (replicas, n, NUM_SPIN_COMPONENTS[d]), mean_square))
-    if directions is not None and scene.has_elements:
+    if directions is not None:
         tangents = ExchangeTangents.initial(directions, scene, velocity, replicas)
-    elif directions is not None:
-        tangents = DSMCTangents.initial(directions, replicas, v.dtype)
     zero = jnp.zeros(replicas, v.dtype)
     duration = waiting_time(jax.random.fold_in(key, 1), dynamics.scheme.candidates, zero)
     return DSMCState(
@@ -96,11 +97,8 @@ def dsmc_records(
     *,
     units: Units | None = None,
     save: Callable[[Particles], Any] | None = None,
-) -> dict[str, Any]:
+) -> Records:
     """Return the records of each replica, with their status as "fault".
-
-    If the state has tangents, there are also the derivatives that
-    `jaxgran.gradients.rule.differentiable` takes.
 
     Args:
         dynamics: of the run.
@@ -131,44 +129,19 @@ def dsmc_records(
         values["rotational_temperature"] = energy * left.true_spin**2
     fast = status.flag(status.TOO_FAST, state.missed > ALLOWED_MISSED * state.collisions + 1)
     values["fault"] = fast | status.flag(status.NOT_FINITE, ~jnp.isfinite(theta))
+    saved = None
     if save is not None and units is not None:
         spin = None if scene.surface is None else state.particles[..., 2 * d :] * left.true_spin
         arrays = jnp.full_like(v, jnp.nan), v * left.velocity, spin  # there are no positions
-        values |= snapshot.saved_records(save, snapshot.particles(units, replicas, *arrays))
+        saved = snapshot.saved(save, snapshot.particles(units, replicas, *arrays))
     tangents = state.tangents
-    if isinstance(tangents, ExchangeTangents):
-        size, drag_along = (scheme.num_particles, d), tangents.directions.drag
-        values |= exchange_derivatives(values, tangents, scene.drag, drag_along, state.time, size)
-    elif tangents is not None:
-        spreading = 2 * jnp.mean(jnp.sum(displacement * velocity, axis=-1), axis=-1)
-        rates = _rates(values, scene.law, d) | {"displacement": spreading}
-        c = tangents.log_temperature
-        at_scaled_time = {
-            "temperature": theta[None] * c,
-            "velocity_correlation": correlation[None] * (c / 2 + tangents.paths.correlation_along),
-            "displacement": tangents.paths.displacement_along,
-            "collisions": jnp.zeros_like(c),
-        }
-        known = {name: values[name] for name in at_scaled_time}
-        values |= with_tangents(known, at_scaled_time, rates, tangents.clock)
-        values["sonine.rate"] = rates["sonine"]
-    return values
-
-
-def _rates(values: dict[str, Array], law: ReducedLaw, d: int) -> dict[str, Array]:
-    """Return the rates of change with time of all records but <dr^2>, in a Maxwell-Sonine gas."""
-    theta, a2 = values["temperature"], values["sonine"]
-    speed = jnp.sqrt(theta)
-    moments = jax.vmap(lambda speed: averages.impact_moments(law, speed, d))(speed)
-    terms = jnp.stack([jnp.ones_like(a2), a2, a2**2])
-    mu_2, mu_4, nu_v = speed[None] * jnp.einsum("nrt,tn->rn", moments, terms)
-    cooling = 2 / d * mu_2
-    return {
-        "temperature": -cooling * theta,
-        "sonine": 2 * cooling * (1 + a2) - 4 / (d * (d + 2)) * mu_4,
-        "velocity_correlation": -nu_v * values["velocity_correlation"],
-        "collisions": averages.collision_rate(a2, d) * speed,
-    }
+    if tangents is None:
+        return Records(values, {}, {}, saved)
+    size = scheme.num_particles, d
+    rates, slopes = exchange_derivatives(
+        values, tangents, scene.drag, tangents.directions.drag, state.time, size
+    )
+    return Records(values, rates, slopes, saved)
 
 
 def run_dsmc(
@@ -178,7 +151,7 @@ def run_dsmc(
     replicas: int,
     run: Run,
     settings: dict[str, Any],
-) -> Outputs:
+) -> Result:
     """Run from the host if all numbers are known, otherwise in compiled code.
 
     A replica is nan from its first fault on.
@@ -195,7 +168,8 @@ def run_dsmc(
     words, save = jax.random.bits(key, (2,), jnp.uint32), snapshot.save_function(run.save)
     state = initial_dsmc_state(dynamics, words, directions, replicas)
     if any_traced(inputs):
-        records = _run_traced(dynamics, inputs.times, state, words, units=inputs.units, save=save)
+        options: dict[str, Any] = {"units": inputs.units, "save": save}
+        records: Any = _run_traced(dynamics, inputs.times, state, words, **options)
         fault = status.OK
     else:
         scheme, dtype = dynamics.scheme, state.clock.dtype
@@ -209,7 +183,7 @@ def run_dsmc(
             arguments = dynamics, state, np.asarray(end, dtype), words, max_steps
             return block_until_ready(compiled(*arguments, False))
 
-        def observe(state: DSMCState, **options: Any) -> dict[str, Any]:
+        def observe(state: DSMCState, **options: Any) -> Records:
             arguments = dynamics, copy_buffers(state), state.time, words, max_steps
             return dsmc_records(dynamics, compiled(*arguments, True), first, **options)
 
@@ -235,23 +209,20 @@ def run_dsmc(
 
 
 @jax.jit
-def _nan_from_faults(records: dict[str, Any], fault: Int[Array, ""]) -> Outputs:
+def _nan_from_faults(records: Records, fault: Int[Array, ""]) -> Result:
     """Return the results of a run, with nan in a replica from its first fault on."""
-    faults = records.pop("fault")
+    values = dict(records.values)
+    faults = values.pop("fault")
     failed = jnp.cumsum(faults != status.OK, axis=0) > 0
-    records |= {
-        name: jax.tree.map(partial(snapshot.nan_where, failed), x)
-        for name, x in records.items()
-        if "." not in name
-    }
+    values, saved = jax.tree.map(partial(snapshot.nan_where, failed), (values, records.saved))
     fault = fault | jnp.bitwise_or.reduce(faults, axis=None)
-    return Outputs(None, None, records, fault.astype(jnp.int32))
+    return Result(records._replace(values=values, saved=saved), None, fault.astype(jnp.int32))
 
 
 @partial(jax.jit, static_argnames="save")
 def _run_traced(
     dynamics: DSMCDynamics, times: Array, state: DSMCState, words: Array, **options: Any
-) -> dict[str, Any]:
+) -> Records:
     first = state.particles[..., : dynamics.scheme.dimension]
     max_steps, in_parts = jnp.asarray(2**31 - 1, jnp.int32), jnp.array([False, True])
 

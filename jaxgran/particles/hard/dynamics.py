@@ -14,8 +14,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, UInt32
 
 from jaxgran._utils import status
-from jaxgran.gradients import rule
-from jaxgran.gradients.tangents import ExchangeTangents, ImpactTangents
+from jaxgran.gradients.rule import Records
+from jaxgran.gradients.tangents import ExchangeTangents
 from jaxgran.particles import neighbours
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import (
@@ -33,8 +33,7 @@ from jaxgran.particles.state import (
     MAX_KICK,
     State,
     advance_time,
-    common_records,
-    derivatives_of_records,
+    common_values,
     drag_decay,
     exchange_derivatives,
     fastest,
@@ -45,11 +44,10 @@ from jaxgran.particles.state import (
     temperature,
     threefry_key,
     time_left,
+    with_dissipated_energy,
 )
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.gas import ReducedScene, SphereScene
-from jaxgran.scene.laws import ReducedLaw
-from jaxgran.theory import averages
 
 MIN_IMPACTS = 8
 """Smallest number of impacts that a window should have, in all replicas together."""
@@ -145,14 +143,12 @@ class HardDynamics(AbstractDynamics):
         return velocity * decay.velocity, None if spin is None else spin * decay.true_spin
 
     def with_tangents(self, state: State, directions: ReducedScene) -> State:
-        material, velocity, replicas = self.scene.material, state.velocity, self.replicas
-        if material.has_elements:
-            tangents = ExchangeTangents.initial(directions, material, velocity, replicas)
-        else:
-            tangents = ImpactTangents.initial(directions.law, replicas, velocity.dtype)
+        tangents = ExchangeTangents.initial(
+            directions, self.scene.material, state.velocity, self.replicas
+        )
         return state._replace(tangents=tangents)
 
-    def observe(self, state: State) -> dict[str, Array]:
+    def observe(self, state: State) -> Records:
         return hard_records(state, self.scene, self.replicas)
 
     def check_start(self, state: State) -> Int[Array, ""]:
@@ -363,10 +359,10 @@ class HardDynamics(AbstractDynamics):
         candidates: ImpactCandidates,
         work: ImpactWork,
         duration: Array,
-    ) -> ImpactTangents | ExchangeTangents:
+    ) -> ExchangeTangents:
         """Return the tangents after a window, from the states before and after it."""
         tangents, scene, replicas = old.tangents, self.scene, self.replicas
-        n, d = len(new.velocity) // replicas, new.velocity.shape[1]
+        material = scene.material
         lost = _sum_by_replica(work.dissipated, candidates, replicas)
         impacts = _sum_by_replica(work.impacts, candidates, replicas)
         replica = candidates.replica
@@ -375,33 +371,29 @@ class HardDynamics(AbstractDynamics):
             of_gains = jnp.concatenate([of_gains, replica])
         gains = jnp.zeros((*work.gains.shape[:-1], replicas), lost.dtype)
         gains = gains.at[..., of_gains].add(work.gains, mode="drop")
-        if isinstance(tangents, ImpactTangents):
-            T = temperature(new.velocity, replicas)
-            energy, trend = 0.5 * d * n * T, cooling_trend(scene.material.law, T, d)
-            rates = tangents.rates.after(
-                lost, impacts / n, energy, T, trend, duration, scene.collision_frequency
-            )
-            return tangents.after(gains, energy + 0.5 * lost, T, duration, rates, trend, d)
-        zero = jnp.zeros(replicas)
-        before, gained = jnp.stack([kinetic_energy(old.velocity, replicas), zero]), -lost[None]
-        gained = jnp.concatenate([gained, jnp.zeros_like(gained)])
+        before = [kinetic_energy(old.velocity, replicas)]
+        gained = [-lost]
         if work.rotational_gain is not None:
             spins = jnp.sum(old.internal.spin.reshape(replicas, -1) ** 2, axis=1)
-            before = before.at[1].set(scene.material.surface.inertia / 2 * spins)
-            gained = gained.at[1].set(_sum_by_replica(work.rotational_gain, candidates, replicas))
-        if scene.material.drive is not None:
+            before.append(material.surface.inertia / 2 * spins)
+            gained.append(_sum_by_replica(work.rotational_gain, candidates, replicas))
+        num_energies = len(gained)
+        by_direction, by_scale = gains[:-num_energies], gains[-num_energies:]
+        if material.drive is not None:
 
             def heating(material: ReducedScene) -> Array:
                 changed, start = scene._replace(material=material), old.time + old.time_rest
                 first, second = (drive_variance(changed, start, duration, k) for k in (0.0, 1.0))
-                return n * d / 2 * (first + second)
+                return old.velocity.size / replicas / 2 * (first + second)
 
-            heat, linear = jax.linearize(heating, scene.material)
+            heat, linear = jax.linearize(heating, material)
+            by_direction = by_direction.at[:, 0].add(jax.vmap(linear)(tangents.directions)[:, None])
             # Heating does not depend on the speeds, unlike the frequency of impacts.
-            gains = gains.at[:-2, 0].add(jax.vmap(linear)(tangents.directions)[:, None])
-            gains = gains.at[-2, 0].add(-heat)
-            gained = gained.at[0].add(heat)
-        return tangents.after(before, gained, gains, impacts / 2)
+            by_scale = by_scale.at[0, 0].add(-heat)
+            gained[0] = gained[0] + heat
+        return tangents.after(
+            jnp.stack(before), jnp.stack(gained), by_direction, by_scale, impacts / 2
+        )
 
 
 def drive_variance(
@@ -412,17 +404,6 @@ def drive_variance(
     return kick_variance(strength, scene.drag_rates, start, jnp.asarray(duration), place)
 
 
-def cooling_trend(
-    law: ReducedLaw, temperature: Float[Array, "replicas"], dimension: int
-) -> Float[Array, "replicas"]:
-    """Return the cooling rate of a Maxwellian gas as a function of T, up to a factor."""
-
-    def rate(speed):
-        return averages.impact_moments(law, speed, dimension)[0, 0] * speed
-
-    return jax.vmap(rate)(jnp.sqrt(temperature))
-
-
 def _sum_by_replica(values: Array, candidates: ImpactCandidates, replicas: int) -> Array:
     """Return the sums over the slots of each replica; an empty slot belongs to none."""
     sums = jnp.zeros(replicas, values.dtype)
@@ -430,39 +411,50 @@ def _sum_by_replica(values: Array, candidates: ImpactCandidates, replicas: int) 
 
 
 @partial(jax.jit, static_argnames="replicas")
-def hard_records(state: State, scene: SphereScene, replicas: int) -> dict[str, Array]:
-    """Return the records of a state; with tangents, also those that `rule.with_tangents` adds.
+def hard_records(state: State, scene: SphereScene, replicas: int) -> Records:
+    """Return the records of a state.
 
     In a scene with elements the dissipated energy includes all losses in impacts and to drag.
     """
-    values, displacement, velocity = common_records(state, scene, replicas)
+    values, velocity = common_values(state, scene, replicas)
     material, tangents, (n, d) = scene.material, state.tangents, velocity.shape[1:]
     values["regularised"] = 2 / n * state.internal.regularised
+    if material.has_elements:
+        values |= _values_with_elements(state, scene, values)
+    if tangents is None:
+        return Records(values, {}, {})
+    drag_directions = jax.tree.map(
+        lambda x: x * scene.collision_frequency, tangents.directions.drag
+    )
+    time = state.time + state.time_rest
+    rates, slopes = exchange_derivatives(
+        values, tangents, scene.drag_rates, drag_directions, time, (n, d)
+    )
     if not material.has_elements:
-        if tangents is None:
-            return values
-        T = values["temperature"]
-        cooling = tangents.rates.cooling(cooling_trend(material.law, T, d))
-        derivatives, rates = derivatives_of_records(
-            values, displacement, velocity, tangents, cooling
-        )
-        return rule.with_tangents(values, derivatives, rates, tangents.clock)
+        rates, slopes = (with_dissipated_energy(x, d) for x in (rates, slopes))
+    return Records(values, rates, slopes)
+
+
+def _values_with_elements(
+    state: State, scene: SphereScene, values: dict[str, Array]
+) -> dict[str, Array]:
+    """Return the records that drag changes, and those of rotation."""
+    replicas = len(values["temperature"])
+    n, d = len(state.velocity) // replicas, state.velocity.shape[1]
     velocity_factor, spin_factor, drag = jnp.ones(()), jnp.ones(()), scene.drag_rates
     if drag is not None:
         velocity_factor, _, spin_factor = drag_decay(drag, state.time + state.time_rest)
     initial = kinetic_energy(state.first_velocity, replicas) / n
     lost = initial - velocity_factor**2 * (initial - state.dissipated / n)
-    values["temperature"] = values["temperature"] * velocity_factor**2
-    values["velocity_correlation"] = values["velocity_correlation"] * velocity_factor
+    changed = {
+        "temperature": values["temperature"] * velocity_factor**2,
+        "velocity_correlation": values["velocity_correlation"] * velocity_factor,
+    }
     if state.internal.spin is not None:  # None in equilibration
+        surface = scene.material.surface
         square = jnp.mean(state.internal.spin.reshape(replicas, -1) ** 2, axis=1)
-        values["rotational_temperature"] = material.surface.inertia * square * spin_factor**2
-        initial = NUM_SPIN_COMPONENTS[d] / 2 * material.surface.ratio
+        changed["rotational_temperature"] = surface.inertia * square * spin_factor**2
+        initial = NUM_SPIN_COMPONENTS[d] / 2 * surface.ratio
         kept = spin_factor**2 * (initial + state.internal.rotational_gain / n)
         lost = lost + initial - kept
-    values["dissipated_energy"] = lost
-    if tangents is None:
-        return values
-    drag_along = jax.tree.map(lambda x: x * scene.collision_frequency, tangents.directions.drag)
-    time = state.time + state.time_rest
-    return values | exchange_derivatives(values, tangents, drag, drag_along, time, (n, d))
+    return changed | {"dissipated_energy": lost}

@@ -5,9 +5,8 @@ Units here: the diameter, the mass and the first temperature are 1. Times and po
 extrapolated back to the start of the window. With drag, velocities, spins and time are transformed:
 see `jaxgran.particles.state`. Spins here are then the transformed ones, which drag does not change.
 
-For tangents see `jaxgran.gradients.tangents`. The tangents of a scene with elements follow the
-energy that each impact exchanges, as a function of the numbers of the material and of the scale of
-all velocities and spins.
+Tangents (`jaxgran.gradients.tangents`) follow the energy that each impact exchanges, as a function
+of the numbers of the material and of the scale of all velocities and spins.
 """
 
 from functools import partial
@@ -17,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxgran.gradients.tangents import ExchangeTangents, ImpactTangents
+from jaxgran.gradients.tangents import ExchangeTangents
 from jaxgran.particles.hard.prediction import ImpactCandidates, Paths, first_impacts
 from jaxgran.particles.state import State, drag_decay, tangential_impulse, temperature
 from jaxgran.scene.elements import wall_impact_ratio
@@ -115,31 +114,37 @@ def exchange_gains(
     impact: ImpactEvents,
     happens: Bool[Array, "rows"],
     axis: Int[Array, "rows"] | None = None,
-) -> Float[Array, "changes 2 rows"]:
-    """Return the tangents of the gains of both energies, as `ExchangeTangents.after` takes them."""
+) -> Float[Array, "changes energies rows"]:
+    """Return the tangents of the gain of each energy.
 
-    def energies(material: ReducedScene, velocity: Array, spin: Array) -> Array:
-        # All velocities and all spins are multiplied by exp(...).
-        if material.surface is not None:
+    They are along the directions of `tangents`, then in the logarithm of all velocities, and of all
+    spins where spheres rotate, as `ExchangeTangents.after` takes them.
+    """
+
+    def energies(material: ReducedScene, log_scales: Float[Array, "energies"]) -> Array:
+        factor = jnp.exp(log_scales[0])
+        scaled = impact._replace(relative=impact.relative * factor, speed=impact.speed * factor)
+        if material.surface is not None and impact.spin is not None:
             # At a given energy spins are smaller where the inertia is larger.
             inertia = scene.material.surface.inertia
-            spin = spin - 0.5 * jnp.log(material.surface.inertia / inertia)
-        factor = jnp.exp(velocity)
-        scaled = impact._replace(
-            relative=impact.relative * factor,
-            speed=impact.speed * factor,
-            spin=None if impact.spin is None else impact.spin * jnp.exp(spin),
-        )
-        _, lost, _, gain = impact_effect(scene._replace(material=material), scaled, axis)
-        gain = jnp.zeros_like(lost) if gain is None else gain
-        return jnp.where(happens, jnp.stack([-lost, gain]), 0.0)
+            log_spin = log_scales[1] - 0.5 * jnp.log(material.surface.inertia / inertia)
+            scaled = scaled._replace(spin=impact.spin * jnp.exp(log_spin))
+        effect = impact_effect(scene._replace(material=material), scaled, axis)
+        gained = [-effect.lost]
+        if effect.rotational_gain is not None:
+            gained.append(effect.rotational_gain)
+        return jnp.where(happens, jnp.stack(gained), 0.0)
 
-    zero, one = (jnp.full((), x, impact.speed.dtype) for x in (0.0, 1.0))
-    _, linear = jax.linearize(energies, scene.material, zero, zero)
-    no_direction = jax.tree.map(jnp.zeros_like, scene.material)
-    by_direction = jax.vmap(lambda direction: linear(direction, zero, zero))(tangents.directions)
-    by_scale = jnp.stack([linear(no_direction, one, zero), linear(no_direction, zero, one)])
-    return jnp.concatenate([by_direction, by_scale])
+    num_energies = tangents.energies.shape[1]
+    none = jnp.zeros(num_energies, impact.speed.dtype)
+    _, linear = jax.linearize(energies, scene.material, none)
+    num_directions = len(tangents.energies)
+    scales = jnp.concatenate([jnp.zeros((num_directions, num_energies)), jnp.eye(num_energies)])
+
+    def padded(directions: Array) -> Array:
+        return jnp.pad(directions, [(0, num_energies), *[(0, 0)] * (directions.ndim - 1)])
+
+    return jax.vmap(linear)(jax.tree.map(padded, tangents.directions), scales.astype(none.dtype))
 
 
 MAX_ROUNDS = 100_000
@@ -162,8 +167,7 @@ class ImpactWork(NamedTuple):
         pending: whether the last round executed an impact.
         num_rounds: number of rounds.
         gains: tangents of the energy gained in impacts of pairs, and of slots on walls if there are
-            walls, along directions in the material, see `ImpactTangents` and `exchange_gains`;
-            without tangents, no changes.
+            walls, see `exchange_gains`; without tangents, no changes.
     """
 
     paths: Paths
@@ -176,7 +180,7 @@ class ImpactWork(NamedTuple):
     max_speed2: Float[Array, "slots"]
     pending: Bool[Array, ""]
     num_rounds: Int[Array, ""]
-    gains: Float[Array, "changes *energies rows"]
+    gains: Float[Array, "changes energies rows"]
 
 
 def execute_impacts(
@@ -243,12 +247,9 @@ def execute_impacts(
         events = ImpactEvents(start_time + s, -normal, next_impacts.w, speed, spin, elastic)
         effect = impact_effect(scene, events)
         gains = work.gains
-        if isinstance(tangents, ExchangeTangents):  # each of two loses half of the energy
+        if tangents is not None:  # each of two loses half of the energy
             more = 2 * exchange_gains(scene, tangents, events, executable)
             gains = gains.at[..., :num_rows].add(more)
-        elif tangents is not None:  # the law's unit of speed is sqrt(2)
-            more = 2 * tangents.gains(scene.material.law, events.speed * 0.5**0.5)
-            gains = gains + jnp.where((executable & ~too_soon & ~all_elastic)[None], more, 0.0)
 
         # From the rows of pairs to the slots of their spheres.
         unpaired, row = row == num_rows, jnp.minimum(row, num_rows - 1)
@@ -274,7 +275,7 @@ def execute_impacts(
                 start_time + wall_s, outwards, paths.v, speed, paths.spin, elastic
             )
             on_wall = impact_effect(scene, events, axis)
-            if isinstance(tangents, ExchangeTangents):
+            if tangents is not None:
                 more = exchange_gains(scene, tangents, events, at_wall, axis)
                 gains = gains.at[..., num_rows:].add(more)
             effect = jax.tree.map(partial(_where_rows, at_wall), on_wall, effect)
@@ -308,12 +309,11 @@ def execute_impacts(
         return work.pending & (work.num_rounds < MAX_ROUNDS)
 
     counts, zeros = jnp.zeros_like(slots), jnp.zeros(len(slots), paths.x.dtype)
-    shape = 0, num_rows
-    if isinstance(tangents, ImpactTangents):
-        shape = len(tangents.log_temperature) + 1, num_rows
-    elif tangents is not None:
+    shape = 0, 1, num_rows
+    if tangents is not None:
+        num_directions, num_energies, _ = tangents.energies.shape
         num_walls = 0 if scene.container is None else len(slots)
-        shape = len(tangents.energies) + 2, 2, num_rows + num_walls
+        shape = num_directions + num_energies, num_energies, num_rows + num_walls
     work = ImpactWork(
         paths=paths,
         dissipated=zeros,

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, Shaped
 
 from jaxgran._utils import status
-from jaxgran.gradients import rule
-from jaxgran.gradients.tangents import ContactTangents, component_along, ratio_or_zero
+from jaxgran.gradients.rule import Records
+from jaxgran.gradients.tangents import ContactTangents, RateSums, component_along
 from jaxgran.particles import neighbours, observables
 from jaxgran.particles.capacity import Capacity, max_skin
 from jaxgran.particles.dynamics import (
@@ -44,13 +44,13 @@ from jaxgran.particles.state import (
     State,
     advance_time,
     centred,
-    common_records,
-    derivatives_of_records,
+    common_values,
     fastest,
     initial_spins,
     kinetic_energy,
     peculiar_velocity,
     time_left,
+    with_dissipated_energy,
 )
 from jaxgran.scene.gas import ReducedContact, ReducedScene, SphereScene
 from jaxgran.theory.equations import COOLING_CORRECTION
@@ -75,6 +75,10 @@ RECOVERY_BLOCKS = 200
 
 REACH_MARGIN = 1.5
 """Largest distance of a sphere in a block, over the free flight of the fastest sphere."""
+
+
+LOSS, COLLISIONS, ROTATION = range(3)
+"""Changes of which tangents have rates: energy lost, collisions, energy gained by rotation."""
 
 
 class SoftState(NamedTuple):
@@ -142,14 +146,16 @@ class SoftDynamics(AbstractDynamics):
         return dataclasses.replace(self, scene=self.scene._replace(material=material))
 
     def with_tangents(self, state: State, directions: ReducedScene) -> State:
-        spin, surface, along = state.internal.spin, self.scene.material.surface, directions.surface
-        spin_tangent = None
+        spin, surface = state.internal.spin, self.scene.material.surface
+        changes, spin_tangent = 2, None
         if spin is not None:
+            changes = 3
             # Spins of q s^2 = ratio: nan along a ratio that is 0, of which they are a square root.
-            growth = jnp.where(along.ratio == 0, 0.0, along.ratio / surface.ratio)
-            growth -= along.inertia / surface.inertia
+            along = directions.surface.ratio
+            growth = jnp.where(along == 0, 0.0, along / surface.ratio)
             spin_tangent = 0.5 * growth[:, None, None] * spin[None]
-        tangents = ContactTangents.initial(directions, state.velocity, self.replicas, spin_tangent)
+        rates = RateSums.zero(changes, self.replicas, state.velocity.dtype)
+        tangents = ContactTangents.initial(directions, state.velocity, rates, spin_tangent)
         return state._replace(tangents=tangents)
 
     def to_lab_frame(self, state: State, velocity: Array) -> tuple[Array, Array | None]:
@@ -162,7 +168,7 @@ class SoftDynamics(AbstractDynamics):
         spin = initial_spins(key, state.velocity, self.replicas, surface.ratio / surface.inertia)
         return state._replace(internal=state.internal._replace(spin=spin))
 
-    def observe(self, state: State) -> dict[str, Array]:
+    def observe(self, state: State) -> Records:
         return soft_records(state, self.scene, self.replicas)
 
     @jax.jit
@@ -345,6 +351,7 @@ class SoftDynamics(AbstractDynamics):
 
         def move(spheres: Spheres, material: ReducedScene):
             """Return all spheres after free flight, the members after the block, and energies."""
+            material = _with_surfaces(material, scene.material)
             walls = material.walls
             if walls is not None:
                 walls = walls._replace(law=_of_rows(walls.law, replica_of_member))
@@ -376,7 +383,8 @@ class SoftDynamics(AbstractDynamics):
         if tangents is None or len(tangents.clock) == 0:
             ends, (work, lost_to_drag) = move(spheres, scene.material)
         else:
-            material, material_tangents = _material_by_replica(scene.material, tangents)
+            material = _with_surfaces(scene.material)
+            material, material_tangents = _material_by_replica(material, tangents)
             ends, end_tangents, (work, lost_to_drag) = jax.vmap(
                 lambda *tangent: jax.jvp(move, (spheres, material), tangent, has_aux=True),
                 out_axes=(None, 0, None),
@@ -439,32 +447,28 @@ class SoftDynamics(AbstractDynamics):
         velocity = peculiar_velocity(scene, new.velocity, replicas)
         T, velocity = observables.temperature(velocity), velocity.reshape(new.velocity.shape)
         energy = kinetic_energy(velocity, replicas)
-        spin, gain_ratio = new.internal.spin, tangents.rotational_gain
-        if spin is not None and gain_ratio is not None:
+        passed = duration * jnp.sqrt(T)
+        stored, trend = new.internal.elastic, cooling_trend(scene, T)
+        collisions = 2 * replicas / len(new.position) * begun
+        amounts = [lost, collisions]
+        trends = [(energy + stored) * trend * duration, passed]
+        spin = new.internal.spin
+        if spin is not None:
             # In contacts rotation gained its change less that by drag.
             first, last = (kinetic_energy(s, replicas) for s in (old.internal.spin, spin))
             gain = last - first
             if (drag := scene.drag_rates) is not None:
                 gain += drag.rotational_rate * duration * (first + last)
             gain = scene.material.surface.inertia * gain
-            lost += gain
-            passed = duration * jnp.sqrt(T) * scene.collision_frequency
-            ratio = ratio_or_zero(rotational_temperature(scene, spin, replicas), T)
-            gain_ratio = gain_ratio.after(passed, gain, energy * passed, ratio)
-        collisions, trend = 2 * replicas / len(new.position) * begun, cooling_trend(scene, T)
-        stored, frequency = new.internal.elastic, scene.collision_frequency
-        tangents = tangents._replace(
-            rates=tangents.rates.after(
-                lost, collisions, energy + stored, T, trend, duration, frequency
-            ),
-            elapsed=tangents.elapsed + duration,
-            thermal_elapsed=tangents.thermal_elapsed + duration * jnp.sqrt(T),
-            rotational_gain=gain_ratio,
+            amounts = [lost + gain, collisions, gain]
+            trends.append(energy * passed)
+        rates = tangents.rates.after(
+            jnp.stack(amounts), jnp.stack(trends), passed * scene.collision_frequency
         )
-        passed = tangents.elapsed * jnp.sqrt(jnp.mean(T))
-        due = passed * scene.collision_frequency >= self.projection
-        cooling = cooling_rate(scene, tangents, T)
-        projected = tangents.projected(velocity, cooling, spin)
+        tangents = tangents._replace(rates=rates, elapsed=tangents.elapsed + duration)
+        since = tangents.elapsed * jnp.sqrt(jnp.mean(T))
+        due = since * scene.collision_frequency >= self.projection
+        projected = tangents.projected(velocity, spin)
         return jax.tree.map(lambda new, old: jnp.where(due, new, old), projected, tangents)
 
     def recover(self, now: Progress, before: State) -> tuple[State, Int[Array, ""]]:
@@ -507,31 +511,34 @@ def _faster(material: ReducedScene, factor: ArrayLike) -> ReducedScene:
     return _with_laws(material, faster)._replace(drag=drag)
 
 
+def _with_surfaces(material: ReducedScene, source: ReducedScene | None = None) -> ReducedScene:
+    """Return a material with the surfaces of spheres and walls of another one, or without any.
+
+    Derivatives in the numbers of surfaces are refused, so that they have no tangents.
+    """
+    walls = material.walls
+    if walls is not None:
+        walls = walls._replace(surface=source and source.walls.surface)
+    return material._replace(surface=source and source.surface, walls=walls)
+
+
 def _material_by_replica(
     material: ReducedScene, tangents: ContactTangents
 ) -> tuple[ReducedScene, ReducedScene]:
-    """Return the material and its tangents, by replica for all that a change of clock changes.
+    """Return a material without surfaces and its tangents, by replica.
 
     Velocities that are (1 + c/2) times as large in the same material are those of a slower clock
     in the material for spheres that are (1 - c/2) times as fast.
     """
     c, one = tangents.log_temperature, jnp.ones_like(tangents.elapsed)
     by_clock = jax.jvp(partial(_faster, material), (one,), (-0.5 * one,))[1]
-
-    def with_surfaces_of(numbers: ReducedScene, source: ReducedScene | None) -> ReducedScene:
-        walls, surface = numbers.walls, source and source.surface
-        if walls is not None:
-            walls = walls._replace(surface=source and source.walls.surface)
-        return numbers._replace(surface=surface, walls=walls)
-
-    def by_replica(change: Callable[..., Array], *numbers: ReducedScene) -> ReducedScene:
-        without_surfaces = [with_surfaces_of(each, None) for each in numbers]
-        return with_surfaces_of(jax.tree.map(change, *without_surfaces), numbers[0])
-
-    rows = by_replica(lambda x: jnp.broadcast_to(x, c.shape[1:]), material)
-    return rows, by_replica(
-        lambda direction, change: direction[:, None] + c * change, tangents.directions, by_clock
+    rows = jax.tree.map(lambda x: jnp.broadcast_to(x, c.shape[1:]), material)
+    slopes = jax.tree.map(
+        lambda direction, change: direction[:, None] + c * change,
+        _with_surfaces(tangents.directions),
+        by_clock,
     )
+    return rows, slopes
 
 
 def cooling_trend(
@@ -550,7 +557,7 @@ def cooling_rate(
     scene: SphereScene, tangents: ContactTangents, temperature: Float[Array, "replicas"]
 ) -> Float[Array, "replicas"]:
     """Return ``-d ln T/dt`` at a temperature, by contacts and drag."""
-    by_contacts = tangents.rates.cooling(cooling_trend(scene, temperature))
+    by_contacts = tangents.rates.rate(LOSS, cooling_trend(scene, temperature))
     drag = scene.drag_rates
     return by_contacts if drag is None else by_contacts + 2 * drag.rate
 
@@ -564,39 +571,44 @@ def rotational_temperature(
 
 
 @partial(jax.jit, static_argnames="replicas")
-def soft_records(state: State, scene: SphereScene, replicas: int) -> dict[str, Array]:
-    """Return the records of a state; with tangents, also those that `rule.with_tangents` adds.
+def soft_records(state: State, scene: SphereScene, replicas: int) -> Records:
+    """Return the records of a state.
 
-    The derivative of T is that of the run up to the projection; those of the other records are
-    estimated from it. The elastic energy goes as ``T^(7/5) alpha^(-2/5)``.
+    The derivative of T is that of the run up to the projection; the derivatives of the other
+    records are estimated from it. The elastic energy goes as ``T^(7/5) alpha^(-2/5)``.
     """
-    values, travelled, velocity = common_records(state, scene, replicas)
-    values["elastic_energy"] = state.internal.elastic / velocity.shape[1]
+    values, velocity = common_values(state, scene, replicas)
+    num_particles, d = velocity.shape[1:]
+    values["elastic_energy"] = state.internal.elastic / num_particles
     spin = state.internal.spin
     if spin is not None:  # it is None during equilibration
         values["rotational_temperature"] = rotational_temperature(scene, spin, replicas)
     if state.tangents is None:
-        return values
+        return Records(values, {}, {})
     tangents, T, U = state.tangents, values["temperature"], values["elastic_energy"]
     cooling = cooling_rate(scene, tangents, T)
-    projected = tangents.projected(velocity.reshape(state.velocity.shape), cooling)
+    projected = tangents.projected(velocity.reshape(state.velocity.shape))
     c = projected.log_temperature
-    along, rates = derivatives_of_records(values, travelled, velocity, projected, cooling)
     stiffer = (tangents.directions.law.alpha / scene.material.law.alpha)[:, None]
-    along["elastic_energy"] = (1.4 * c - 0.4 * stiffer) * U[None]
-    rates["elastic_energy"] = -1.4 * cooling * U
-    if spin is None:
-        return rule.with_tangents(values, along, rates, projected.clock)
-    name, inertia = "rotational_temperature", scene.material.surface.inertia
-    T_rot = values[name]
-    logs = (tangents.directions.surface.inertia / inertia)[:, None] + tangents.log_temperature
-    logs += 2 * component_along(tangents.spin, spin, replicas)
-    gain = tangents.rotational_gain.at(ratio_or_zero(T_rot, T))
-    rate = velocity.shape[-1] / spin.shape[1] * gain * scene.collision_frequency * T**1.5
-    if (drag := scene.drag_rates) is not None:
-        rate -= 2 * drag.rotational_rate * T_rot
-    along[name], rates[name] = logs * T_rot[None], rate
-    # The tangents of paths are known only for smooth spheres.
-    paths = {"displacement", "velocity_correlation"}
-    known = {name: x for name, x in values.items() if name not in paths}
-    return values | rule.with_tangents(known, along, rates, projected.clock)
+    rates = {
+        "temperature": -cooling * T,
+        "collisions": tangents.rates.rate(COLLISIONS, jnp.sqrt(T)),
+        "elastic_energy": -1.4 * cooling * U,
+    }
+    at_place = {
+        "temperature": c * T[None],
+        "collisions": jnp.zeros_like(c),
+        "elastic_energy": (1.4 * c - 0.4 * stiffer) * U[None],
+    }
+    if spin is not None:
+        T_rot = values["rotational_temperature"]
+        logs = tangents.log_temperature + 2 * component_along(tangents.spin, spin, replicas)
+        energy = 0.5 * d * num_particles * T
+        gain = tangents.rates.rate(ROTATION, energy * jnp.sqrt(T))
+        rate = 2 / (num_particles * spin.shape[1]) * gain
+        if (drag := scene.drag_rates) is not None:
+            rate -= 2 * drag.rotational_rate * T_rot
+        at_place["rotational_temperature"] = logs * T_rot[None]
+        rates["rotational_temperature"] = rate
+    slopes = {name: x - rates[name][None] * projected.clock for name, x in at_place.items()}
+    return Records(values, with_dissipated_energy(rates, d), with_dissipated_energy(slopes, d))
