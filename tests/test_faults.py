@@ -2,10 +2,8 @@
 
 import os
 import re
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import jax
@@ -15,9 +13,7 @@ import pytest
 
 import jaxgran
 from jaxgran import Run
-from jaxgran.gradients.rule import Records
-from jaxgran.particles import dynamics as moving
-from jaxgran.particles.run import block_until_ready, in_thread, run_through_times
+from jaxgran.particles import spheres as moving
 from tests.beads import glass_beads, spheres
 
 GAS = glass_beads(0.3, packing_fraction=0.1)
@@ -88,23 +84,6 @@ def test_second_derivatives_are_refused(kind):
 # --- runs that stop ------------------------------------------------------------------------------
 
 
-class Standing:
-    """A state whose time does not advance."""
-
-    time = np.zeros(())
-
-
-def test_a_run_that_stands_still_ends():
-    state, records, fault = run_through_times(
-        Standing(),
-        np.ones(1),
-        lambda s, end: s,
-        lambda s: Records({"temperature": jnp.ones(())}, {}, {}),
-    )
-    assert "no longer advances" in jaxgran.explain_status(fault)
-    assert np.isnan(records.values["temperature"])
-
-
 @pytest.mark.slow
 def test_blocks_that_stand_still_end(monkeypatch):
     monkeypatch.setattr(moving, "MIN_FLIGHT", 1e9)  # no flight is long enough
@@ -114,33 +93,6 @@ def test_blocks_that_stand_still_end(monkeypatch):
     jax.clear_caches()
     assert "no longer advances" in jaxgran.explain_status(curve.status)
     assert np.isnan(curve.temperature[0])
-
-
-@jax.jit
-def some_seconds():
-    # Not of scalars: JAX does not return before such programs have ended.
-    return jax.lax.fori_loop(0, 3000, lambda i, x: 0.99 * x @ x, jnp.eye(300))
-
-
-@pytest.mark.parametrize(
-    "wait", [lambda: in_thread(lambda: time.sleep(20)), lambda: block_until_ready(some_seconds())]
-)
-def test_waiting_can_be_interrupted(wait):
-    some_seconds.lower().compile()
-
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    old = signal.signal(signal.SIGALRM, interrupt)
-    began = time.monotonic()
-    try:
-        signal.setitimer(signal.ITIMER_REAL, 0.3)
-        with pytest.raises(KeyboardInterrupt):
-            wait()
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, old)
-    assert time.monotonic() - began < 1.5
 
 
 @pytest.mark.slow

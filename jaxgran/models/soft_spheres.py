@@ -169,7 +169,7 @@ class SoftSpheres(AbstractSpheres):
                         "Give the walls tangential_damping and friction instead, or use "
                         "HardSpheres."
                     )
-        self._ask_about_overlaps(gas)
+            self._ask_about_overlaps(gas)
 
     def _ask_about_overlaps(self, gas: Gas) -> None:
         """Warn if contacts of the start store much energy, which becomes thermal motion."""
@@ -220,8 +220,8 @@ class SoftSpheres(AbstractSpheres):
             friction = None
             if box.tangential_damping is not None and box.friction is not None:
                 friction = ReducedFriction(box.tangential_damping, box.friction)
-            walls = ReducedWalls(ReducedContact.of(wall_law.of_wall(), gas), None, friction)
-        material = ReducedScene(ReducedContact.of(law, gas), surface, walls)
+            walls = ReducedWalls(ReducedContact.from_law(wall_law.of_wall(), gas), None, friction)
+        material = ReducedScene(ReducedContact.from_law(law, gas), surface, walls)
         return sphere_scene(gas, self.num_particles, material)
 
     def refused_derivatives(self, scene: SphereScene) -> dict[str, Any]:
@@ -236,17 +236,29 @@ class SoftSpheres(AbstractSpheres):
             lengths = [scene.side, scene.container, scene.collision_frequency]
         return {FRICTION_REFUSED: friction, LENGTHS_REFUSED: lengths}
 
-    def dynamics(self, scene: SphereScene, plan: Plan) -> SoftDynamics:
-        """Return the equations of motion of the spheres."""
-        projection = concrete_array(self.projection or np.inf, scene.side.dtype)
-        steps = self.steps_per_contact, plan.steps
-        return SoftDynamics(scene, plan.replicas, plan.capacity, *steps, projection)
+    def motion(
+        self, scene: SphereScene, shape: tuple[int, int, int], plan: Plan, engine: str
+    ) -> SoftDynamics:
+        """Return the motion of the spheres."""
+        return SoftDynamics(
+            scene=scene,
+            shape=shape,
+            capacity=plan.capacity,
+            crowded=plan.equilibration_capacity,
+            listed_by_skin=self.listed_by_skin,
+            engine=engine,
+            steps_per_contact=self.steps_per_contact,
+            steps_per_block=plan.steps,
+            projection=concrete_array(self.projection or np.inf, scene.side.dtype),
+        )
 
-    def planned(self, scene: SphereScene, dimension: int, spare: float | None = None) -> Plan:
+    def planned(
+        self, scene: SphereScene, dimension: int, replicas: int, spare: float | None = None
+    ) -> Plan:
         """Return static sizes; capacities were measured for phi = .01 to .4 (disks: .5) and
         t_c/tau_c = .003 to .3."""
-        d, n = dimension, self.replicas * self.num_particles
-        around = self.neighbourhood(scene, d)
+        d, n = dimension, replicas * self.num_particles
+        around = self.neighbourhood(scene, d, replicas)
         duration = round_up(float(scene.contact_duration), grid(n)[0])
         # A block lasts at most a contact, less if spheres fly far in that time.
         contacts_flown = MAX_SPEED * float(scene.contact_duration) / BLOCK_FLIGHT
@@ -263,5 +275,7 @@ class SoftSpheres(AbstractSpheres):
         expected = around.listed, near, touching, 2 * touching / (1 + 1.6 * touching**0.6)
         # At random positions the additional touching pairs are about those without correlation.
         extra = 1.3 * around.in_contact
-        sizes = capacities(expected, around.lookahead, spare or 1.2, extra, n)
-        return Plan(self.replicas, self.steps_per_contact, steps, *sizes)
+        capacity, crowded = capacities(expected, around.lookahead, spare or 1.2, extra, n)
+        names = "num_particles", "replicas", "steps_per_contact"
+        made_for = tuple((name, getattr(self, name)) for name in names)
+        return Plan(made_for, steps, capacity, crowded)

@@ -347,6 +347,14 @@ def close_pairs(points: Float[np.ndarray, "n d"], side: float, cutoff: float) ->
     return tree.query_pairs(cutoff, output_type="ndarray")
 
 
+def least_distance(points: Float[np.ndarray, "n d"], side: float) -> float:
+    """Return the least distance between two points in a periodic box, and 1 if none is less."""
+    i, j = close_pairs(np.mod(points, side) % side, side, 1.0).T
+    separation = points[i] - points[j]
+    separation = separation - side * np.round(separation / side)
+    return float(np.sqrt(np.min(np.sum(separation**2, axis=1), initial=1.0)))
+
+
 def tree_search(
     position: Float[np.ndarray, "particles d"],
     side: float,

@@ -35,7 +35,7 @@ class Units(NamedTuple):
     mass: Float[Array, ""]
 
     @classmethod
-    def of(cls, gas: Gas, num_particles: int, length: Array, velocity: Array) -> "Units":
+    def from_gas(cls, gas: Gas, num_particles: int, length: Array, velocity: Array) -> "Units":
         """Return the units of N particles of a gas, with units of length and velocity."""
         side = box_side(gas, num_particles)
         return cls(length, velocity, 2 * velocity / gas.diameter, side, gas.mass)

@@ -9,7 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran import DSMC
-from jaxgran.particles.dsmc import collisions
+from jaxgran.particles.dsmc import collisions, dynamics
 from tests.beads import SI, curves_of, glass_beads, hard_gas
 from tests.test_sliding import sliding
 
@@ -79,7 +79,7 @@ def test_elastic_gas_keeps_its_energy_and_its_maxwellian():
 
 @pytest.mark.parametrize("n", [2, 64, 101])
 def test_every_pair_is_about_equally_likely(n):
-    scheme = collisions.Scheme.of(3, n, 0.1)
+    scheme = collisions.Scheme.build(3, n, 0.1)
 
     def drawn(key):
         i, j, k = collisions.draw_pairs(jax.random.bits(key, (4,)), scheme)
@@ -125,7 +125,8 @@ def test_the_step_is_second_order():
 def test_says_when_impacts_are_too_fast(monkeypatch):
     gas = glass_beads(0.15)
     times = jnp.array([3.0]) * gas.mean_free_time
-    monkeypatch.setattr(collisions, "CEILING", 2.0)  # many pairs are faster
+    for module in (collisions, dynamics):  # many pairs are faster
+        monkeypatch.setattr(module, "CEILING", 2.0)
     model = DSMC(1010, replicas=2)  # of a size that no program was compiled for before
     with pytest.raises(RuntimeError, match="many pairs are faster"):
         jaxgran.cool(gas, times, model=model)

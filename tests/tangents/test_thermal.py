@@ -22,15 +22,16 @@ def followed(gas, position, velocity, replicas, end, interval):
     model = SoftSpheres(len(position) // replicas, replicas=replicas, projection=interval)
     model = model.sized_for(gas, spare=4.0)
     scene = model.scene(gas)
-    dynamics = model.dynamics(scene, model.plan)
-    state = dynamics.begin(jnp.asarray(position), jnp.asarray(velocity), 0.4)
+    dynamics = model.dynamics(scene, gas.dimension, replicas)
     along = {"alpha": jnp.zeros(1), "dissipative_constant": jnp.ones(1)}
     law = dataclasses.replace(scene.material.law, **along)
-    state = dynamics.with_tangents(state, scene.material._replace(law=law))
-    while float(state.time) < end:
-        now = dynamics.run_segment(state, end, "sweep")
-        assert int(now.status) == 0
-        state = now.state
+    start = jnp.asarray(position), jnp.asarray(velocity)
+    directions = scene.material._replace(law=law)
+    state = dynamics.initial(start, jax.random.key(0), directions)
+    advance = jax.jit(dynamics.advance)
+    while dynamics.unfinished(state, jnp.asarray(end)):
+        state = advance(state, end)
+    assert int(state.status) == 0
     return state, scene
 
 

@@ -6,7 +6,7 @@ each window begins and ends with half of its kicks. Units as in `jaxgran.particl
 
 import dataclasses
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,34 +18,32 @@ from jaxgran.gradients.rule import Records
 from jaxgran.gradients.tangents import ExchangeTangents
 from jaxgran.particles import neighbours
 from jaxgran.particles.capacity import Capacity
-from jaxgran.particles.dynamics import (
-    FATAL,
-    AbstractDynamics,
-    Progress,
-    initial_progress,
-    repeat_until,
+from jaxgran.particles.elements import (
+    MAX_KICK,
+    drag_decay,
+    exchange_slopes,
+    kick_variance,
+    random_kicks,
+    threefry_key,
 )
 from jaxgran.particles.hard.impacts import MAX_ROUNDS, ImpactWork, execute_impacts
 from jaxgran.particles.hard.prediction import ImpactCandidates, PairRows, Paths, first_impacts
 from jaxgran.particles.neighbours import Pairs, rows_where, select_members
-from jaxgran.particles.setup import allowed_overlap, min_distance
-from jaxgran.particles.state import (
-    MAX_KICK,
-    State,
+from jaxgran.particles.spheres import (
+    FATAL,
+    AbstractSphereDynamics,
+    Segment,
+    SphereState,
     advance_time,
     common_values,
-    drag_decay,
-    exchange_derivatives,
     fastest,
-    initial_spins,
-    kick_variance,
     kinetic_energy,
-    random_kicks,
+    repeat_until,
     temperature,
-    threefry_key,
     time_left,
     with_dissipated_energy,
 )
+from jaxgran.particles.start import initial_spins
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.gas import ReducedScene, SphereScene
 
@@ -68,8 +66,12 @@ MIN_SKIN = 0.2
 """Skin in diameters below which it is not shortened."""
 
 
+ALLOWED_OVERLAP = 1e-9
+"""Overlap in diameters that is allowed in a given start."""
+
+
 class HardState(NamedTuple):
-    """Internal state of hard spheres, see `State`.
+    """Internal state of hard spheres, see `SphereState`.
 
     Attributes:
         age: time since the last impact.
@@ -88,11 +90,11 @@ class HardState(NamedTuple):
     key: UInt32[Array, "3"] | None = None
 
 
-class HardDynamics(AbstractDynamics):
-    """Dynamics of hard spheres in windows of time.
+class HardDynamics(AbstractSphereDynamics):
+    """Hard spheres in windows of time.
 
     Attributes:
-        scene, replicas, capacity: see `AbstractDynamics`.
+        scene, shape, capacity, crowded, listed_by_skin, engine: see `AbstractSphereDynamics`.
         share: impacts per particle in a window.
         contact_time: in mean free times; the impact of a sphere within this time of its last one is
             elastic.
@@ -100,67 +102,66 @@ class HardDynamics(AbstractDynamics):
     """
 
     scene: SphereScene
-    replicas: int = eqx.field(static=True)
+    shape: tuple[int, int, int] = eqx.field(static=True)
     capacity: Capacity = eqx.field(static=True)
+    crowded: Capacity = eqx.field(static=True)
+    listed_by_skin: float = eqx.field(static=True)
+    engine: str = eqx.field(static=True)
     share: float = eqx.field(static=True)
     contact_time: Float[Array, ""]
     all_elastic: Bool[Array, ""]
 
-    def initial_internal(self, num_rows, dtype) -> HardState:
+    def elastic(self) -> "HardDynamics":
+        """Return the dynamics of smooth elastic spheres, between such walls, without drag.
+
+        A drag without effect leaves smooth spheres the program of the run.
+        """
+        material = self.scene.material
+        walls = material.walls
+        if walls is not None:
+            walls = walls._replace(surface=None)
+        drag = jax.tree.map(lambda x: 0 * x, material.drag)
+        material = material._replace(surface=None, walls=walls, drag=drag, drive=None)
+        scene = self.scene._replace(material=material)
+        return dataclasses.replace(self, scene=scene, all_elastic=jnp.ones((), bool))
+
+    def initial_internal(self, velocity: Float[Array, "n d"], key: PRNGKeyArray) -> HardState:
+        dtype, material = velocity.dtype, self.scene.material
         # The first window is short: at random positions many spheres are near contact.
         rate = self.scene.collision_frequency
         if self.region is not None:
             rate = rate + 2 / jnp.min(self.region)
+        spin = gain = counted_key = None
+        if material.surface is not None:
+            mean_square = (material.surface.ratio / material.surface.inertia).astype(dtype)
+            spin = initial_spins(key, self.shape, mean_square)
+            gain = jnp.zeros(self.replicas, dtype)
+        if material.drive is not None:
+            words = jax.random.bits(jax.random.fold_in(key, 3), (2,), jnp.uint32)
+            counted_key = jnp.concatenate([words, jnp.zeros(1, jnp.uint32)])
         return HardState(
-            age=jnp.full(num_rows, jnp.inf, dtype),
+            age=jnp.full(len(velocity), jnp.inf, dtype),
             regularised=jnp.zeros(self.replicas, jnp.result_type(int)),
             window=jnp.asarray(self.share / (8 * rate), dtype),
+            spin=spin,
+            rotational_gain=gain,
+            key=counted_key,
         )
 
-    def elastic(self) -> "HardDynamics":
+    def initial_tangents(self, state: SphereState, directions: ReducedScene) -> ExchangeTangents:
         material = self.scene.material
-        drag, drive = jax.tree.map(lambda x: 0 * x, (material.drag, material.drive))
-        scene = self.scene._replace(material=material._replace(drag=drag, drive=drive))
-        return dataclasses.replace(self, scene=scene, all_elastic=jnp.ones((), bool))
+        return ExchangeTangents.initial(directions, material, state.velocity, self.replicas)
 
-    def sample_spins(self, state: State, key: PRNGKeyArray) -> State:
-        internal, surface = state.internal, self.scene.material.surface
-        if surface is not None:
-            mean_square = surface.ratio / surface.inertia
-            spin = initial_spins(key, state.velocity, self.replicas, mean_square)
-            gain = jnp.zeros(self.replicas, spin.dtype)
-            internal = internal._replace(spin=spin, rotational_gain=gain)
-        if self.scene.material.drive is not None:
-            words = jax.random.bits(jax.random.fold_in(key, 3), (2,), jnp.uint32)
-            internal = internal._replace(key=jnp.concatenate([words, jnp.zeros(1, jnp.uint32)]))
-        return state._replace(internal=internal)
+    def true_velocities(self, state: SphereState) -> tuple[Array, Array | None]:
+        decay = drag_decay(self.scene.drag_rates, state.time + state.time_rest)
+        spin = state.internal.spin
+        return state.velocity * decay.velocity, None if spin is None else spin * decay.true_spin
 
-    def to_lab_frame(self, state: State, velocity: Array) -> tuple[Array, Array | None]:
-        spin, drag = state.internal.spin, self.scene.drag_rates
-        if drag is None:
-            return velocity, spin
-        decay = drag_decay(drag, state.time + state.time_rest)
-        return velocity * decay.velocity, None if spin is None else spin * decay.true_spin
-
-    def with_tangents(self, state: State, directions: ReducedScene) -> State:
-        tangents = ExchangeTangents.initial(
-            directions, self.scene.material, state.velocity, self.replicas
-        )
-        return state._replace(tangents=tangents)
-
-    def observe(self, state: State) -> Records:
+    def observe(self, state: SphereState) -> Records:
         return hard_records(state, self.scene, self.replicas)
 
-    def check_start(self, state: State) -> Int[Array, ""]:
-        x, side = state.position, self.scene.side
-        closest = min_distance(x, side, self.replicas, self.capacity[:2], "sweep")
-        if (container := self.scene.container) is not None:  # a sphere and its image beyond a wall
-            image = 2 * jnp.min(jnp.minimum(x, container[None] - x))
-            closest = jnp.minimum(closest, image)
-        return status.flag(status.OVERLAPPING, closest < 1 - allowed_overlap(x, side))
-
     @jax.jit
-    def prepare(self, state: State, end: ArrayLike) -> tuple[State, Array, Array]:
+    def prepare(self, state: SphereState, end: ArrayLike) -> tuple[SphereState, Array, Array]:
         """Prepare a neighbour list of the positions in the middle of its life.
 
         Free flight leads there, and the list lives twice as long as one of the current positions.
@@ -178,22 +179,35 @@ class HardDynamics(AbstractDynamics):
         prepared = state._replace(position=listed - flown, image=state.image + image)
         return prepared, listed, jnp.where(life < time_until_end, state.time + life, end)
 
-    def advance(
-        self, state: State, listed: Float[Array, "n d"], pairs: Pairs, end: ArrayLike
-    ) -> Progress:
+    def run_blocks(
+        self, state: SphereState, listed: Float[Array, "n d"], pairs: Pairs, end: ArrayLike
+    ) -> Segment:
+        overlapping = jax.lax.cond(
+            state.fresh, lambda: self._overlaps(state, pairs), lambda: jnp.zeros((), bool)
+        )
+        fault = state.status | status.flag(status.OVERLAPPING, overlapping)
         bound_factor = jnp.ones((), state.position.dtype)
-        first = initial_progress(state, pairs, self.capacity, bound_factor)
-        window = partial(self._advance_window, listed=listed, pairs=pairs, end=end)
+        first = Segment(state._replace(status=fault), jnp.zeros((), bool), bound_factor)
+        window = partial(self._run_window, listed=listed, pairs=pairs, end=end)
         return repeat_until(end, window, first)
 
-    def _advance_window(
-        self, now: Progress, listed: Array, pairs: Pairs, end: ArrayLike
-    ) -> Progress:
+    def _overlaps(self, state: SphereState, pairs: Pairs) -> Bool[Array, ""]:
+        """Return whether spheres of a start overlap others or a wall by more than rounding."""
+        x, side, container = state.position, self.scene.side, self.scene.container
+        separation = x[pairs.i] - x[pairs.j] - pairs.offset
+        square = jnp.sum(separation * separation, -1)
+        in_use = jnp.arange(len(square)) < pairs.count
+        closest = jnp.sqrt(jnp.min(jnp.where(in_use, square, 1.0), initial=1.0))
+        if container is not None:  # a sphere and its image beyond a wall
+            closest = jnp.minimum(closest, 2 * jnp.min(jnp.minimum(x, container[None] - x)))
+        return closest < 1 - allowed_overlap(x.dtype, side)
+
+    def _run_window(self, now: Segment, listed: Array, pairs: Pairs, end: ArrayLike) -> Segment:
         """Run one window, and accept it if no sphere exceeded the speed bound and no check failed.
 
-        `Progress.internal` is the factor by which the bound on speeds is raised.
+        `Segment.retry` is the factor by which the bound on speeds is raised.
         """
-        old, bound_factor = now.state, now.internal
+        old, bound_factor = now.state, now.retry
         time_until_end, scene = time_left(old, end), self.scene
         window = self._window_length(old)
         num_left = jnp.maximum(jnp.ceil(time_until_end / window * (1 - 1e-9)), 1.0)
@@ -221,16 +235,15 @@ class HardDynamics(AbstractDynamics):
         next_duration = jnp.minimum(state.internal.window, time_left(state, end))
         next_position = state.position + state.velocity * next_duration
         next_distance2 = jnp.max(jnp.sum((next_position - listed) ** 2, -1))
-        return Progress(
-            state=state,
+        fault = jnp.where(repeat, status.OK, fault).astype(jnp.int32)
+        return Segment(
+            state=state._replace(status=fault, needed=jnp.maximum(old.needed, candidates.needed)),
             stale=accepted & (next_distance2 > (0.5 * old.skin) ** 2),
-            status=jnp.where(repeat, status.OK, fault).astype(jnp.int32),
-            needed=jnp.maximum(now.needed, candidates.needed),
-            internal=jnp.where(repeat, 1.3 * bound_factor, 1.0),
+            retry=jnp.where(repeat, 1.3 * bound_factor, 1.0),
         )
 
     def _select_candidates(
-        self, state: State, pairs: Pairs, duration: Array, bound: Float[Array, "replicas"]
+        self, state: SphereState, pairs: Pairs, duration: Array, bound: Float[Array, "replicas"]
     ) -> ImpactCandidates:
         """Select the pairs that touch in free flight, and all that may touch once paths have
         changed. Particles that reach a wall are members, too.
@@ -266,8 +279,8 @@ class HardDynamics(AbstractDynamics):
         return ImpactCandidates(members, rows, members // size, needed)
 
     def _state_after_window(
-        self, state: State, candidates: ImpactCandidates, work: ImpactWork, duration: Array
-    ) -> State:
+        self, state: SphereState, candidates: ImpactCandidates, work: ImpactWork, duration: Array
+    ) -> SphereState:
         """Return the state after a window at its old time, with the length of the next window."""
 
         def by_replica(values):
@@ -308,29 +321,29 @@ class HardDynamics(AbstractDynamics):
             return new
         return new._replace(tangents=self._tangents_after(state, new, candidates, work, duration))
 
-    def recover(self, now: Progress, before: State) -> tuple[State, Int[Array, ""]]:
+    def recover(self, now: Segment, before: SphereState) -> SphereState:
         """Shorten the window if the skin was exceeded at once, and the skin of a crowded list."""
         state = now.state
         fresh = state.time == before.time  # otherwise a new neighbour list is enough
-        shorten = status.has(now.status, status.SKIN_EXCEEDED) & fresh
+        shorten = status.has(state.status, status.SKIN_EXCEEDED) & fresh
         # Only with enough capacity, so that a resumed run with another capacity does the same.
-        crowded = now.needed[0] > MAX_LISTED_PER_PARTICLE * len(state.position)
-        crowded &= now.status == status.OK
+        crowded = state.needed[0] > MAX_LISTED_PER_PARTICLE * len(state.position)
+        crowded &= state.status == status.OK
         shorter = jnp.maximum(0.8 * state.skin, jnp.minimum(state.skin, MIN_SKIN))
         window = jnp.where(shorten, 0.5 * state.internal.window, state.internal.window)
-        recovered = state._replace(
+        return state._replace(
             skin=jnp.where(crowded, shorter, state.skin),
             internal=state.internal._replace(window=window),
+            status=state.status & FATAL,
         )
-        return recovered, now.status & FATAL
 
-    def _apply_drive(self, state: State, duration: ArrayLike, place: float) -> State:
+    def _apply_drive(self, state: SphereState, duration: ArrayLike, place: float) -> SphereState:
         """Return the state with half of the kicks of a window, at its begin (place 0) or end (1).
 
         Time and window are those before the window; the velocities may already have had kicks.
         """
         counted_key, replicas = state.internal.key, self.replicas
-        if self.scene.material.drive is None or counted_key is None:
+        if counted_key is None:
             return state
         variance = drive_variance(self.scene, state.time + state.time_rest, duration, place)
         key = jax.random.fold_in(threefry_key(counted_key[:2]), counted_key[2])
@@ -342,7 +355,7 @@ class HardDynamics(AbstractDynamics):
         internal = state.internal._replace(key=counted_key.at[2].add(jnp.uint32(1)))
         return state._replace(velocity=velocity, internal=internal)
 
-    def _window_length(self, state: State) -> Float[Array, ""]:
+    def _window_length(self, state: SphereState) -> Float[Array, ""]:
         """Return a length with which the kicks of a window are small beside the velocities."""
         if self.scene.material.drive is None:
             return state.internal.window
@@ -354,8 +367,8 @@ class HardDynamics(AbstractDynamics):
 
     def _tangents_after(
         self,
-        old: State,
-        new: State,
+        old: SphereState,
+        new: SphereState,
         candidates: ImpactCandidates,
         work: ImpactWork,
         duration: Array,
@@ -396,6 +409,14 @@ class HardDynamics(AbstractDynamics):
         )
 
 
+def allowed_overlap(dtype: Any, side: Any) -> Any:
+    """Return the overlap up to which spheres of a start count as hard.
+
+    It is at least the overlap of spheres in contact by rounding of positions.
+    """
+    return jnp.maximum(ALLOWED_OVERLAP, 10 * side * jnp.finfo(dtype).eps)
+
+
 def drive_variance(
     scene: SphereScene, start: Float[Array, ""], duration: ArrayLike, place: float
 ) -> Float[Array, ""]:
@@ -411,7 +432,7 @@ def _sum_by_replica(values: Array, candidates: ImpactCandidates, replicas: int) 
 
 
 @partial(jax.jit, static_argnames="replicas")
-def hard_records(state: State, scene: SphereScene, replicas: int) -> Records:
+def hard_records(state: SphereState, scene: SphereScene, replicas: int) -> Records:
     """Return the records of a state.
 
     In a scene with elements the dissipated energy includes all losses in impacts and to drag.
@@ -427,7 +448,7 @@ def hard_records(state: State, scene: SphereScene, replicas: int) -> Records:
         lambda x: x * scene.collision_frequency, tangents.directions.drag
     )
     time = state.time + state.time_rest
-    rates, slopes = exchange_derivatives(
+    rates, slopes = exchange_slopes(
         values, tangents, scene.drag_rates, drag_directions, time, (n, d)
     )
     if not material.has_elements:
@@ -436,14 +457,13 @@ def hard_records(state: State, scene: SphereScene, replicas: int) -> Records:
 
 
 def _values_with_elements(
-    state: State, scene: SphereScene, values: dict[str, Array]
+    state: SphereState, scene: SphereScene, values: dict[str, Array]
 ) -> dict[str, Array]:
     """Return the records that drag changes, and those of rotation."""
     replicas = len(values["temperature"])
     n, d = len(state.velocity) // replicas, state.velocity.shape[1]
-    velocity_factor, spin_factor, drag = jnp.ones(()), jnp.ones(()), scene.drag_rates
-    if drag is not None:
-        velocity_factor, _, spin_factor = drag_decay(drag, state.time + state.time_rest)
+    decay = drag_decay(scene.drag_rates, state.time + state.time_rest)
+    velocity_factor, spin_factor = decay.velocity, decay.true_spin
     initial = kinetic_energy(state.first_velocity, replicas) / n
     lost = initial - velocity_factor**2 * (initial - state.dissipated / n)
     changed = {

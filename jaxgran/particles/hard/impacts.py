@@ -2,8 +2,8 @@
 
 Units here: the diameter, the mass and the first temperature are 1. Times and positions count as in
 `jaxgran.particles.hard.prediction`: an impact changes both the velocity of a path and its position
-extrapolated back to the start of the window. With drag, velocities, spins and time are transformed:
-see `jaxgran.particles.state`. Spins here are then the transformed ones, which drag does not change.
+extrapolated back to the start of the window. With drag, velocities, spins and time are transformed
+(`jaxgran.particles.elements`), and drag does not change the transformed spins.
 
 Tangents (`jaxgran.gradients.tangents`) follow the energy that each impact exchanges, as a function
 of the numbers of the material and of the scale of all velocities and spins.
@@ -17,8 +17,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxgran.gradients.tangents import ExchangeTangents
+from jaxgran.particles.elements import drag_decay, tangential_impulse
 from jaxgran.particles.hard.prediction import ImpactCandidates, Paths, first_impacts
-from jaxgran.particles.state import State, drag_decay, tangential_impulse, temperature
+from jaxgran.particles.spheres import SphereState, temperature
 from jaxgran.scene.elements import wall_impact_ratio
 from jaxgran.scene.gas import ReducedScene, SphereScene
 
@@ -76,9 +77,9 @@ def impact_effect(
     law, surface, share = material.law, material.surface, 0.5
     if axis is not None:
         law, share = material.walls.law, 1.0  # a wall takes no part of the change of velocity
-    decay = None if material.drag is None else drag_decay(scene.drag_rates, impact.time)
+    decay = drag_decay(scene.drag_rates, impact.time)
     law_speed = speed * 0.5**0.5  # the law's unit of speed is sqrt(2)
-    eps = law.restitution(law_speed if decay is None else law_speed * decay.velocity)
+    eps = law.restitution(law_speed * decay.velocity)
     eps = jnp.where(impact.elastic, 1.0, eps)
     push = share * (1 + eps) * speed
     kick, lost = -push[:, None] * impact.normal, share**2 / 2 * (1 - eps**2) * speed**2
@@ -88,7 +89,7 @@ def impact_effect(
         rotational_gain = spin_change[:, 0]
         if axis is None or material.walls.surface is not None:
             eta = surface.eta if axis is None else surface.eta_on_wall(material.walls.surface)
-            spin_factor = 1.0 if decay is None else decay.spin[:, None]
+            spin_factor = decay.spin[:, None]
             spin = impact.spin * spin_factor
             push = -jnp.sum(kick * impact.normal, -1)
             sideways, sliding_kick, added_spin = tangential_impulse(
@@ -184,7 +185,7 @@ class ImpactWork(NamedTuple):
 
 
 def execute_impacts(
-    state: State,
+    state: SphereState,
     listed: Float[Array, "n d"],
     candidates: ImpactCandidates,
     scene: SphereScene,

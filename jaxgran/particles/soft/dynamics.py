@@ -1,4 +1,4 @@
-"""Dynamics of soft spheres in blocks of time steps, with records and tangents.
+"""Soft spheres in blocks of time steps, with records and tangents.
 
 Spheres that may touch are integrated by time steps; all others fly freely, which is exact. The
 pairs that may touch are selected once a block. Indices are thus fixed within a block, which keeps
@@ -20,13 +20,6 @@ from jaxgran.gradients.rule import Records
 from jaxgran.gradients.tangents import ContactTangents, RateSums, component_along
 from jaxgran.particles import neighbours, observables
 from jaxgran.particles.capacity import Capacity, max_skin
-from jaxgran.particles.dynamics import (
-    FATAL,
-    AbstractDynamics,
-    Progress,
-    initial_progress,
-    repeat_until,
-)
 from jaxgran.particles.neighbours import Pairs, rows_where, select_members
 from jaxgran.particles.soft.forces import (
     PAIR,
@@ -40,18 +33,22 @@ from jaxgran.particles.soft.forces import (
     overlap,
     wall_overlap,
 )
-from jaxgran.particles.state import (
-    State,
+from jaxgran.particles.spheres import (
+    FATAL,
+    AbstractSphereDynamics,
+    Segment,
+    SphereState,
     advance_time,
     centred,
     common_values,
     fastest,
-    initial_spins,
     kinetic_energy,
     peculiar_velocity,
+    repeat_until,
     time_left,
     with_dissipated_energy,
 )
+from jaxgran.particles.start import initial_spins
 from jaxgran.scene.gas import ReducedContact, ReducedScene, SphereScene
 from jaxgran.theory.equations import COOLING_CORRECTION
 
@@ -82,7 +79,7 @@ LOSS, COLLISIONS, ROTATION = range(3)
 
 
 class SoftState(NamedTuple):
-    """Internal state of soft spheres, see `State`.
+    """Internal state of soft spheres, see `SphereState`.
 
     Attributes:
         elastic: energy in contacts.
@@ -99,8 +96,8 @@ class SoftState(NamedTuple):
     spin: Float[Array, "n spins"] | None = None
 
 
-class SoftProgress(NamedTuple):
-    """Progress of soft spheres within one neighbour list, see `Progress`.
+class SoftRetry(NamedTuple):
+    """What changes when a block is repeated, see `Segment`.
 
     Attributes:
         extra: particles whose contacts were detected only after a block had been integrated.
@@ -111,27 +108,25 @@ class SoftProgress(NamedTuple):
     reach_factor: Float[Array, ""]
 
 
-class SoftDynamics(AbstractDynamics):
-    """Dynamics of viscoelastic spheres in blocks of equal time steps.
+class SoftDynamics(AbstractSphereDynamics):
+    """Viscoelastic spheres in blocks of equal time steps.
 
     Attributes:
-        scene, replicas, capacity: see `AbstractDynamics`.
+        scene, shape, capacity, crowded, listed_by_skin, engine: see `AbstractSphereDynamics`.
         steps_per_contact: steps in the mean contact duration at the current temperature.
         steps_per_block: steps for which the candidates for contact are fixed.
         projection: mean free times between thermal projections of tangents.
     """
 
     scene: SphereScene
-    replicas: int = eqx.field(static=True)
+    shape: tuple[int, int, int] = eqx.field(static=True)
     capacity: Capacity = eqx.field(static=True)
+    crowded: Capacity = eqx.field(static=True)
+    listed_by_skin: float = eqx.field(static=True)
+    engine: str = eqx.field(static=True)
     steps_per_contact: int = eqx.field(static=True)
     steps_per_block: int = eqx.field(static=True)
     projection: Float[Array, ""]
-
-    def initial_internal(self, num_rows, dtype) -> SoftState:
-        # The elastic energy of the start is counted by the first `advance`.
-        zeros = jnp.zeros(self.replicas, dtype)
-        return SoftState(zeros, jnp.ones((), dtype), jnp.zeros((), jnp.int32), zeros)
 
     def elastic(self) -> "SoftDynamics":
         """Return the dynamics of smooth spheres without drag, between elastic walls."""
@@ -139,48 +134,53 @@ class SoftDynamics(AbstractDynamics):
         def lossless(law: ReducedContact) -> ReducedContact:
             return ReducedContact(law.alpha, 0.0 * law.alpha, law.clipped)
 
-        material = _with_laws(self.scene.material, lossless)
-        drag = jax.tree.map(lambda x: 0.0 * x, material.drag)
-        walls = material.walls and material.walls._replace(surface=None)
-        material = material._replace(surface=None, walls=walls, drag=drag)
+        material = _with_surfaces(_with_laws(self.scene.material, lossless), None)
+        material = material._replace(drag=jax.tree.map(lambda x: 0.0 * x, material.drag))
         return dataclasses.replace(self, scene=self.scene._replace(material=material))
 
-    def with_tangents(self, state: State, directions: ReducedScene) -> State:
-        spin, surface = state.internal.spin, self.scene.material.surface
-        changes, spin_tangent = 2, None
-        if spin is not None:
-            changes = 3
-            # Spins of q s^2 = ratio: nan along a ratio that is 0, of which they are a square root.
-            along = directions.surface.ratio
-            growth = jnp.where(along == 0, 0.0, along / surface.ratio)
-            spin_tangent = 0.5 * growth[:, None, None] * spin[None]
-        rates = RateSums.zero(changes, self.replicas, state.velocity.dtype)
-        tangents = ContactTangents.initial(directions, state.velocity, rates, spin_tangent)
-        return state._replace(tangents=tangents)
-
-    def to_lab_frame(self, state: State, velocity: Array) -> tuple[Array, Array | None]:
-        return velocity, state.internal.spin
-
-    def sample_spins(self, state: State, key: PRNGKeyArray) -> State:
+    def initial_internal(self, velocity: Float[Array, "n d"], key: PRNGKeyArray) -> SoftState:
         surface = self.scene.material.surface
-        if surface is None:
-            return state
-        spin = initial_spins(key, state.velocity, self.replicas, surface.ratio / surface.inertia)
-        return state._replace(internal=state.internal._replace(spin=spin))
+        spin = None
+        if surface is not None:
+            mean_square = (surface.ratio / surface.inertia).astype(velocity.dtype)
+            spin = initial_spins(key, self.shape, mean_square)
+        zeros = jnp.zeros(self.replicas, velocity.dtype)
+        return SoftState(
+            elastic=zeros,  # counted by the first segment
+            refinement=jnp.ones((), velocity.dtype),
+            num_good=jnp.zeros((), jnp.int32),
+            drift=zeros,
+            spin=spin,
+        )
 
-    def observe(self, state: State) -> Records:
+    def initial_tangents(self, state: SphereState, directions: ReducedScene) -> ContactTangents:
+        spin = state.internal.spin
+        changes, spin_tangent = [LOSS, COLLISIONS], None
+        if spin is not None:
+            changes.append(ROTATION)
+            # Spins of q s^2 = ratio: nan along a ratio that is 0, of which they are a square root.
+            along, ratio = directions.surface.ratio, self.scene.material.surface.ratio
+            growth = jnp.where(along == 0, 0.0, along / ratio)
+            spin_tangent = 0.5 * growth[:, None, None] * spin[None]
+        rates = RateSums.zero(len(changes), self.replicas, state.velocity.dtype)
+        return ContactTangents.initial(directions, state.velocity, rates, spin_tangent)
+
+    def true_velocities(self, state: SphereState) -> tuple[Array, Array | None]:
+        return state.velocity, state.internal.spin
+
+    def observe(self, state: SphereState) -> Records:
         return soft_records(state, self.scene, self.replicas)
 
     @jax.jit
-    def prepare(self, state: State, end: ArrayLike) -> tuple[State, Array, ArrayLike]:
+    def prepare(self, state: SphereState, end: ArrayLike) -> tuple[SphereState, Array, ArrayLike]:
         side = self.scene.side
         inside = neighbours.wrap(side, state.position)
         image = state.image + jnp.round((state.position - inside) / side).astype(jnp.int32)
         return state._replace(position=inside, image=image), inside, end
 
-    def advance(
-        self, state: State, listed: Float[Array, "n d"], pairs: Pairs, end: ArrayLike
-    ) -> Progress:
+    def run_blocks(
+        self, state: SphereState, listed: Float[Array, "n d"], pairs: Pairs, end: ArrayLike
+    ) -> Segment:
         x, material = state.position, self.scene.material
         xi, _, touching = overlap(x, pairs.i, pairs.j, pairs.offset)
         touching &= jnp.arange(len(xi)) < pairs.count
@@ -191,25 +191,23 @@ class SoftDynamics(AbstractDynamics):
             depth = wall_overlap(self.scene.container, x)[0]
             stored = jnp.sum(elastic_energy(depth, material.walls.law, WALL), axis=-1)
             elastic += jnp.sum(stored.reshape(self.replicas, -1), axis=1)
-        internal = SoftProgress(jnp.zeros(len(x), bool), jnp.ones((), x.dtype))
         state = state._replace(internal=state.internal._replace(elastic=elastic))
-        first = initial_progress(state, pairs, self.capacity, internal)
-        block = partial(self._advance_block, listed=listed, pairs=pairs, end=end)
+        retry = SoftRetry(jnp.zeros(len(x), bool), jnp.ones((), x.dtype))
+        first = Segment(state, jnp.zeros((), bool), retry)
+        block = partial(self._run_block, listed=listed, pairs=pairs, end=end)
         return repeat_until(end, block, first)
 
-    def _advance_block(
-        self, now: Progress, listed: Array, pairs: Pairs, end: ArrayLike
-    ) -> Progress:
+    def _run_block(self, now: Segment, listed: Array, pairs: Pairs, end: ArrayLike) -> Segment:
         """Run one block, and accept it if all its contacts were expected and no check failed."""
-        old, internal = now.state, now.internal
+        old, retry = now.state, now.retry
         duration, num_left, hottest = self._block_duration(old, end)
         # The fastest sphere of all replicas, which share their blocks.
         speed = jnp.max(fastest(old.velocity, self.replicas))
         # At rest the first reach is 0, and the next one is given by the energy in contacts.
-        from_contacts = (internal.reach_factor - 1) * jnp.sqrt(hottest)
-        reach = REACH_MARGIN * speed * internal.reach_factor + from_contacts
+        from_contacts = (retry.reach_factor - 1) * jnp.sqrt(hottest)
+        reach = REACH_MARGIN * speed * retry.reach_factor + from_contacts
         reach = reach * duration
-        candidates = self._select_candidates(old, pairs, duration, 2 * reach, internal.extra)
+        candidates = self._select_candidates(old, pairs, duration, 2 * reach, retry.extra)
         new, lost, exchanged, unexpected, max_square_move = self._integrate_block(
             old, candidates, duration
         )
@@ -241,20 +239,25 @@ class SoftDynamics(AbstractDynamics):
         fault = jnp.where(invalid > 0, invalid, fault)
         new = new._replace(internal=settings)
         accepted = (fault == status.OK) & ~repeat
-        enlarged = jnp.where(too_far, 2 * internal.reach_factor, internal.reach_factor)
-        return Progress(
-            state=jax.tree.map(partial(jnp.where, accepted), new, old),
+        enlarged = jnp.where(too_far, 2 * retry.reach_factor, retry.reach_factor)
+        state = jax.tree.map(partial(jnp.where, accepted), new, old)
+        needed = jnp.maximum(old.needed, candidates.needed)
+        return Segment(
+            state=state._replace(status=fault, needed=needed),
             stale=accepted & (displacement + 2 * speed * duration > 0.5 * old.skin),
-            status=fault,
-            needed=jnp.maximum(now.needed, candidates.needed),
-            internal=SoftProgress(
-                extra=jnp.where(accepted, False, internal.extra | unexpected),
+            retry=SoftRetry(
+                extra=jnp.where(accepted, False, retry.extra | unexpected),
                 reach_factor=jnp.where(accepted, 1.0, enlarged),
             ),
         )
 
     def _select_candidates(
-        self, state: State, pairs: Pairs, duration: Array, margin: Array, extra: Bool[Array, "n"]
+        self,
+        state: SphereState,
+        pairs: Pairs,
+        duration: Array,
+        margin: Array,
+        extra: Bool[Array, "n"],
     ) -> ContactCandidates:
         """Select the pairs that would touch in free flight, and the pairs near those.
 
@@ -311,7 +314,7 @@ class SoftDynamics(AbstractDynamics):
             needed=jnp.stack([pairs.count, pairs.lookahead, num_near, *counts]),
         )
 
-    def _block_duration(self, state: State, end: ArrayLike) -> tuple[Array, Array, Array]:
+    def _block_duration(self, state: SphereState, end: ArrayLike) -> tuple[Array, Array, Array]:
         """Return the duration of the next block, the number of blocks of this length until the end,
         and the temperature of the hottest replica, with the energy in its contacts."""
         scene, velocity = self.scene, centred(state.velocity, self.replicas)
@@ -335,8 +338,8 @@ class SoftDynamics(AbstractDynamics):
         return time_until_end / num_left, num_left, hottest
 
     def _integrate_block(
-        self, state: State, candidates: ContactCandidates, duration: Array
-    ) -> tuple[State, Array, Array, Bool[Array, "n"], Array]:
+        self, state: SphereState, candidates: ContactCandidates, duration: Array
+    ) -> tuple[SphereState, Array, Array, Bool[Array, "n"], Array]:
         """Return the state after a block, at its old time, and what decides whether it is accepted.
 
         That is, by replica, the energy lost in contacts and to drag, and the work of the elastic
@@ -429,7 +432,7 @@ class SoftDynamics(AbstractDynamics):
             new = new._replace(tangents=self._project_if_due(state, new, lost, begun, duration))
         return new, lost_with_drag, exchanged, unexpected, jnp.max(jnp.sum(moved**2, -1))
 
-    def _energy(self, state: State) -> Float[Array, "replicas"]:
+    def _energy(self, state: SphereState) -> Float[Array, "replicas"]:
         energy = kinetic_energy(state.velocity, self.replicas)
         if state.internal.spin is not None:
             inertia = self.scene.material.surface.inertia
@@ -437,7 +440,7 @@ class SoftDynamics(AbstractDynamics):
         return energy + state.internal.elastic
 
     def _project_if_due(
-        self, old: State, new: State, lost: Array, begun: Array, duration: Array
+        self, old: SphereState, new: SphereState, lost: Array, begun: Array, duration: Array
     ) -> ContactTangents:
         """Return the tangents after a block, projected if a projection is due.
 
@@ -471,22 +474,23 @@ class SoftDynamics(AbstractDynamics):
         projected = tangents.projected(velocity, spin)
         return jax.tree.map(lambda new, old: jnp.where(due, new, old), projected, tangents)
 
-    def recover(self, now: Progress, before: State) -> tuple[State, Int[Array, ""]]:
+    def recover(self, now: Segment, before: SphereState) -> SphereState:
         """Halve a step that was too large, and lengthen a skin that was exceeded."""
-        state, longest = now.state, max_skin(self.scene.side)
+        state = now.state
+        longest = max_skin(self.scene.side)
         fresh = state.time == before.time  # otherwise a new neighbour list is enough
-        exceeded = status.has(now.status, status.SKIN_EXCEEDED) & fresh
-        shorten = status.has(now.status, status.STEP_TOO_LARGE)
+        exceeded = status.has(state.status, status.SKIN_EXCEEDED) & fresh
+        shorten = status.has(state.status, status.STEP_TOO_LARGE)
         shorten |= exceeded & (state.skin >= longest)
         unrecoverable = shorten & (state.internal.refinement >= MAX_REFINEMENT)
         halve = shorten & ~unrecoverable
         finer = jnp.where(halve, 2 * state.internal.refinement, state.internal.refinement)
         num_good = jnp.where(halve, 0, state.internal.num_good)
-        skin = jnp.where(exceeded, jnp.minimum(1.5 * state.skin, longest), state.skin)
-        recovered = state._replace(
-            skin=skin, internal=state.internal._replace(refinement=finer, num_good=num_good)
+        return state._replace(
+            skin=jnp.where(exceeded, jnp.minimum(1.5 * state.skin, longest), state.skin),
+            internal=state.internal._replace(refinement=finer, num_good=num_good),
+            status=jnp.where(unrecoverable, state.status, state.status & FATAL),
         )
-        return recovered, jnp.where(unrecoverable, now.status, now.status & FATAL)
 
 
 def _of_rows(numbers: Any, replica: Int[Array, "rows"]) -> Any:
@@ -571,7 +575,7 @@ def rotational_temperature(
 
 
 @partial(jax.jit, static_argnames="replicas")
-def soft_records(state: State, scene: SphereScene, replicas: int) -> Records:
+def soft_records(state: SphereState, scene: SphereScene, replicas: int) -> Records:
     """Return the records of a state.
 
     The derivative of T is that of the run up to the projection; the derivatives of the other

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxgran.particles.state import surface_direction, torque
+from jaxgran.particles.elements import surface_direction, torque
 from jaxgran.scene.contact import contact_force, midpoint_rate
 from jaxgran.scene.gas import ReducedContact, ReducedFriction, ReducedScene, SphereScene
 
