@@ -137,7 +137,8 @@ class ContactTangents(NamedTuple):
             rates: sums before the first collision.
             spin: tangents of the spins; None for smooth spheres.
         """
-        p, dtype = len(jax.tree.leaves(directions)[0]), velocity.dtype
+        p = len(jax.tree.leaves(directions)[0])
+        dtype = velocity.dtype
         zeros = jnp.zeros((p, rates.amounts.shape[1]), dtype)
         particle_zeros = jnp.zeros((p, *velocity.shape), dtype)
         return cls(

@@ -43,16 +43,12 @@ class DSMC(AbstractParticleModel):
     walls take (`jaxgran.scene.elements`); drag, exactly, by collisions in transformed time
     (`jaxgran.particles.elements`), up to gamma t = 18 (8 in float32); a drive, with half of the
     kicks at the beginning of each step and half at its end, on subsets of the particles in turn
-    (`jaxgran.particles.dsmc.dynamics`). With elements the derivatives of T, T_rot and
-    collisions are known (`jaxgran.gradients.tangents`), others are nan.
+    (`jaxgran.particles.dsmc.dynamics`).
 
-    The curve is differentiable in every float of the gas and in the times, forward and reverse.
-    The derivatives are estimates. They are taken at a fixed scaled time s (``ds = sqrt(T) dt``, so
-    that the order of collisions does not depend on the speeds). The gas is assumed to remember its
-    temperature only; <dr^2> and the velocity correlation are assumed to change by the first Sonine
-    order of diffusion. The derivative of a_2 in a float of the gas is not known, and is nan. Rates
-    of change with time are those of the Maxwell-Sonine distribution. Second derivatives are
-    refused.
+    Derivatives of T, T_rot and collisions are known in every float of the gas and in the times,
+    forward and reverse. The gas is assumed to remember its energies only, of translation and of
+    rotation, whose tangents grow by what each collision, walls, drag and a drive exchange
+    (`jaxgran.gradients.tangents`). All other derivatives are nan. Second derivatives are refused.
 
     Args:
         num_particles: N, >= 2, on one device.

@@ -70,32 +70,28 @@ class HardSpheres(AbstractSpheres):
         neighbours: the search for pairs: "sweep" (compiled with the rest), "scipy" (on the host),
             "jax-md" (on the device, not inside `jax.jit`), or "auto" for the fastest here.
         differences: step in the logarithm of an impact's loss, in (0, 0.5], of derivatives by
-            differences of whole runs (`jaxgran.gradients.rule`), 0.3 for most uses. They need two
-            more runs for each number of the law and have noise, but no bias in a gas that
+            differences of whole runs (`jaxgran.gradients.differences`), 0.3 for most uses. They
+            need two more runs for each number of the law and have noise, but no bias in a gas that
             clusters. None for projected derivatives.
         plan: static sizes of arrays, see `sized_for`.
 
-    Derivatives of T, collisions, <dr^2> and the dissipated energy are known in every float of the
-    gas and in the times, forward and reverse, for any law. They are thermally projected at every
-    impact (see `jaxgran.gradients.tangents`): the gas is assumed to remember its temperature only,
-    and to continue to cool at the rate of its last 5 mean free times. Compared with finite
-    differences d ln T/d ln A is right within 5 % in boxes shorter than L_c, but 14 % too large
-    after 10 mean free times where flows have begun to hold energy (phi = .2, beta = .3, 1.1 L_c).
-    The curve's ``derivative_bias`` estimates this bias, and `differences` avoids it.
-    Derivatives of <dr^2> use the first Sonine order of diffusion (see
-    `jaxgran.gradients.tangents`), those of the velocity correlation in time a decay at 2/d of the
-    collision rate. The density acts through Enskog's collision frequency only: at fixed N it also
-    changes the box, and with it the growth of flows, which is left out. The derivatives of a_2 and
-    of the final particles are not known, and are nan. Second derivatives are refused. Each replica
-    is simulated in the frame in which it is at rest, unless there are walls or drag. With a given
-    start T_0 is a unit only, and its derivative is 0; the start scales with the diameter.
+    Derivatives of T, T_rot and collisions are known in every float of the gas and in the times,
+    forward and reverse, for any law; of smooth spheres also those of the dissipated energy. The gas
+    is assumed to remember its energies only, of translation and of rotation, whose tangents grow by
+    what each impact, walls, drag and a drive exchange (`jaxgran.gradients.tangents`). Compared with
+    finite differences d ln T/d ln A is right within 5 % in boxes shorter than L_c, but 14 % too
+    large after 10 mean free times where flows have begun to hold energy (phi = .2, beta = .3,
+    1.1 L_c). The curve's ``derivative_bias`` estimates this bias, and `differences` avoids it. The
+    density acts through Enskog's collision frequency only: at fixed N it also changes the box, and
+    with it the growth of flows, which is left out. All other derivatives, as of a_2, <dr^2>, the
+    velocity correlation and the final particles, are nan. Second derivatives are refused. Each
+    replica is simulated in the frame in which it is at rest, unless there are walls or drag. With a
+    given start T_0 is a unit only, and its derivative is 0; the start scales with the diameter.
 
-    With elements the derivatives of T, T_rot and collisions are known in every float of the gas,
-    and all others are nan. The gas is then assumed to remember its two energies
-    (`jaxgran.gradients.tangents`), but not the positions of its spheres, except that it is denser
-    before walls the more energy they take (`jaxgran.scene.elements`). Compared with differences
-    (N = 500, eps_w = .8) a derivative in eps_w is right within 2 %; that of T_rot in beta_t of
-    rough walls, before which spins differ from those in the middle, is up to 20 % too small.
+    The positions of spheres between walls are not remembered, except that the gas is denser before
+    walls the more energy they take (`jaxgran.scene.elements`). Compared with differences (N = 500,
+    eps_w = .8) a derivative in eps_w is right within 2 %; that of T_rot in beta_t of rough walls,
+    before which spins differ from those in the middle, is up to 20 % too small.
 
     Raises:
         ValueError: for numbers out of range.
@@ -197,7 +193,8 @@ class HardSpheres(AbstractSpheres):
     ) -> Plan:
         """Return static sizes; capacities were measured for phi = .001 to .4 (disks: .6) and
         N = 125 to 50 000."""
-        d, n = dimension, replicas * self.num_particles
+        d = dimension
+        n = replicas * self.num_particles
         around = self.neighbourhood(scene, d, replicas)
         share = max(WINDOW_SHARE, 2 * MIN_IMPACTS / n)
         fastest = SPEED_MARGIN * (0.5 + (2 * math.log(n)) ** 0.5)  # of Maxwell's n speeds

@@ -90,7 +90,8 @@ class AbstractParticleModel(AbstractModel):
         invalid, fault = self.invalid_times(gas, times)
         if self.start is not None:  # then T_0 is a constant unit of speed in derivatives
             gas = gas.replace(temperature=jax.lax.stop_gradient(gas.temperature))
-        scene, units = self.scene(gas), self.units(gas)
+        scene = self.scene(gas)
+        units = self.units(gas)
         reduced = times * units.velocity / units.length
         if self.transforms_time and gas.drag is not None:
             reduced = transformed_times(scene.drag_rates, reduced)
@@ -158,7 +159,8 @@ class AbstractParticleModel(AbstractModel):
         saves_particles: bool,
     ) -> CoolingCurve:
         """Return the curve of a run in SI, with nan at invalid times."""
-        records, saved = result.records.values, result.records.saved
+        records = result.records.values
+        saved = result.records.saved
         scales = {
             "1": 1.0,
             "m^2": units.length**2,

@@ -94,25 +94,22 @@ class SoftSpheres(AbstractSpheres):
             agree for 0.02 to 0.5 (see `jaxgran.gradients.tangents`). None for the plain
             derivative, which is exact, and useless after 3 to 5 collisions per particle.
         differences: step in the logarithm of an impact's loss, in (0, 0.5], of derivatives by
-            differences of whole runs (`jaxgran.gradients.rule`), 0.3 for most uses. They need two
-            more runs for each of A and alpha and have noise, but no bias in a gas that clusters.
-            None for projected derivatives.
+            differences of whole runs (`jaxgran.gradients.differences`), 0.3 for most uses. They
+            need two more runs for each of A and alpha and have noise, but no bias in a gas that
+            clusters. None for projected derivatives.
         plan: static sizes of arrays, see `sized_for`.
 
-    Derivatives of T, collisions, <dr^2> and the energies are known in every float of the gas,
-    forward and reverse: a gas depends on (alpha, A), its collision frequency and the times only.
-    The run computes tangents in alpha and A. The density acts through Enskog's collision frequency
-    only: at fixed N it also changes the box, and with it the growth of flows, which is left out.
-    The tangent of T is exact but for the projection, and the others are estimated from it: those of
-    <dr^2> by the first Sonine order of diffusion (see `jaxgran.gradients.tangents`), that of the
-    velocity correlation in time by a decay at 2/d of the collision rate. The run also computes
-    tangents in walls, drag and friction, and of T_rot (`jaxgran.gradients.tangents`); between walls
-    derivatives in lengths and the density are refused. Derivatives that are not known are nan:
-    those of a_2 and of the final particles, with friction those of <dr^2> and the velocity
-    correlation, and those in a rotational_temperature of 0. Second derivatives are refused. In
-    boxes above L_c derivatives are too large; the curve estimates this bias (``derivative_bias``),
-    and `differences` avoids it. Each replica is simulated in the frame in which it is at rest. With
-    a given start T_0 is a unit only, and its derivative is 0.
+    Derivatives of T, T_rot, collisions and the energies are known, forward and reverse: a gas
+    depends on (alpha, A), its walls and drag, its collision frequency and the times only. The
+    density acts through Enskog's collision frequency only: at fixed N it also changes the box, and
+    with it the growth of flows, which is left out. The tangent of T is exact but for the
+    projection, and the others are estimated from it (`jaxgran.gradients.tangents`). All others, as
+    of a_2, <dr^2>, the velocity correlation and the final particles, and derivatives in a
+    rotational_temperature of 0, are nan. Derivatives in the friction, tangential_damping and
+    inertia of contacts, between walls those in lengths and the density, and second derivatives are
+    refused. In boxes above L_c derivatives are too large; the curve estimates this bias
+    (``derivative_bias``), and `differences` avoids it. Each replica is simulated in the frame in
+    which it is at rest. With a given start T_0 is a unit only, and its derivative is 0.
 
     Raises:
         ValueError: for numbers out of range.
@@ -173,11 +170,13 @@ class SoftSpheres(AbstractSpheres):
 
     def _ask_about_overlaps(self, gas: Gas) -> None:
         """Warn if contacts of the start store much energy, which becomes thermal motion."""
-        start, law = self.start, gas.law
+        start = self.start
+        law = gas.law
         if start is None or any_traced(gas, start) or not isinstance(law, Viscoelastic):
             return
         side = np.broadcast_to(np.asarray(start.box_side, float), (gas.dimension,))
-        stored, diameter = 0.0, float(gas.diameter)
+        stored = 0.0
+        diameter = float(gas.diameter)
         for x in np.asarray(start.position, float):
             tree = scipy.spatial.KDTree(x % side, boxsize=None if gas.container else side)
             distance = tree.sparse_distance_matrix(tree, diameter, output_type="coo_matrix").data
@@ -257,7 +256,8 @@ class SoftSpheres(AbstractSpheres):
     ) -> Plan:
         """Return static sizes; capacities were measured for phi = .01 to .4 (disks: .5) and
         t_c/tau_c = .003 to .3."""
-        d, n = dimension, replicas * self.num_particles
+        d = dimension
+        n = replicas * self.num_particles
         around = self.neighbourhood(scene, d, replicas)
         duration = round_up(float(scene.contact_duration), grid(n)[0])
         # A block lasts at most a contact, less if spheres fly far in that time.

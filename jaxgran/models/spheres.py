@@ -96,7 +96,8 @@ class AbstractSpheres(AbstractParticleModel):
 
     def neighbourhood(self, scene: SphereScene, dimension: int, replicas: int) -> Neighbourhood:
         """Return the expected numbers of neighbours in a scene of known numbers."""
-        side, n = float(scene.filled_side), self.num_particles
+        side = float(scene.filled_side)
+        n = self.num_particles
         around = Neighbourhood.expected(side, n, replicas, dimension, self.listed_by_skin)
         if scene.container is None:
             return around

@@ -134,7 +134,8 @@ def capacities(
         num_particles: number of particles of all replicas, the largest number of members.
     """
     spare = max(spare * grid(num_particles)[1], 1.0)
-    counts, spares = [num_particles * x for x in expected], (spare**0.5, spare, spare, spare)
+    counts = [num_particles * x for x in expected]
+    spares = (spare**0.5, spare, spare, spare)
     pairs, near, contacts, members = (
         int(s * x + 5 * x**0.5) + 64 for s, x in zip(spares, counts, strict=True)
     )

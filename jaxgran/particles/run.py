@@ -89,7 +89,8 @@ class Recorder(eqx.Module):
 
     def __call__(self, state: Any) -> Records:
         """Return the records of a state, nan where it has failed."""
-        dynamics, saved = self.dynamics, None
+        dynamics = self.dynamics
+        saved = None
         failed = jnp.broadcast_to(state.status != status.OK, dynamics.shape[:1])
         if self.save is not None:
             arrays = dynamics.to_lab_frame(state)
@@ -249,7 +250,8 @@ def run_on_host(
     def empty(x: Array) -> np.ndarray:
         return np.zeros((len(times), *x.shape), x.dtype)
 
-    num_done, records = 0, jax.tree.map(empty, observe(state))
+    num_done = 0
+    records = jax.tree.map(empty, observe(state))
     if path is not None and resumed:
         num_done, loaded, records = checkpoint.load(path, described, (0, state, records))
         state = jax.tree.map(jnp.asarray, loaded)
@@ -326,7 +328,9 @@ class HostLoop:
     """
 
     def __init__(self, dynamics: AbstractDynamics, groups: Groups, progress: bool):
-        self.dynamics, self.groups, self.progress = dynamics, groups, progress
+        self.dynamics = dynamics
+        self.groups = groups
+        self.progress = progress
 
     def each(self, function: Callable[[Any, Any], T], shared: Any, group: Any) -> T:
         """Call a short function for each group: with an input of all and one of this group."""
@@ -436,7 +440,9 @@ def _writer(
     """Return a function that writes the particles at time number k to the trajectory."""
     if run.trajectory is None:
         return lambda k, state: None
-    dynamics, units, groups = recorder.dynamics, recorder.units, loop.groups
+    dynamics = recorder.dynamics
+    units = recorder.units
+    groups = loop.groups
     replicas = groups.number * dynamics.shape[0]
     trajectory = Trajectory(run.trajectory, replicas, resumed)
     sphere = Sphere(float(units.length), float(units.mass))

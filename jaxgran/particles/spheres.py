@@ -199,7 +199,8 @@ class AbstractSphereDynamics(AbstractDynamics):
         crowded = elastic.with_capacity(self.crowded)
         placed = reach([(self.placement(), 0.0)], each(_begin_placement, self, key))
         state = each(_begin_equilibration, crowded, (placed, key))
-        settled, end = SETTLING_COLLISIONS / frequency, EQUILIBRATION_COLLISIONS / frequency
+        settled = SETTLING_COLLISIONS / frequency
+        end = EQUILIBRATION_COLLISIONS / frequency
         state = reach([(crowded, settled), (elastic, end)], state)
         return each(_at_rest, self, state)
 
@@ -276,7 +277,8 @@ class AbstractSphereDynamics(AbstractDynamics):
         number is not finite, or a step cannot become shorter. The state is then the given one.
         """
         before, listed, end = self.prepare(state, until)
-        cutoff, sizes = 1 + before.skin, self.capacity[:2]
+        cutoff = 1 + before.skin
+        sizes = self.capacity[:2]
         found = neighbours.search_pairs(
             listed, self.scene.side, cutoff, self.replicas, sizes, self.engine
         )
@@ -295,7 +297,8 @@ class AbstractSphereDynamics(AbstractDynamics):
         needed = jnp.zeros_like(given.needed).at[:2].set(jnp.stack([pairs.count, pairs.lookahead]))
         before = before._replace(status=self.capacity.exceeded_by(needed), needed=needed)
         state = self.recover(self.run_blocks(before, listed, pairs, end), before)
-        fault, needed = state.status, state.needed
+        fault = state.status
+        needed = state.needed
         advanced = elapsed(given, state) > min_duration(given)
         stalled = jnp.where(advanced, 0, given.stalled + 1)
         state = state._replace(fresh=jnp.zeros((), bool))

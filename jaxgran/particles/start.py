@@ -164,7 +164,8 @@ class Placement(AbstractProcess):
 
     def advance(self, state: PlacementState, until: ArrayLike) -> PlacementState:
         """Build a neighbour list, and push until it is stale or no overlap is left."""
-        side, max_pairs = self.side, self.capacity.pairs
+        side = self.side
+        max_pairs = self.capacity.pairs
         replicas, num_particles, dimension = self.shape
         built = neighbours.wrap(side, state.position)
         cutoff = 1 + self.skin

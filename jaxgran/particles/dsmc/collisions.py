@@ -108,7 +108,9 @@ def draw_pairs(
     a large divisor with N (one in a hundred at N = 1000) are up to 1.7 times as likely, and the
     probabilities scatter by 6 % (14 % at N = 64).
     """
-    n, first, second = scheme.num_particles, scheme.first, scheme.second
+    n = scheme.num_particles
+    first = scheme.first
+    second = scheme.second
     strides = jnp.asarray(_strides(n))
     stride = strides[bits[0] % len(strides)]
     apart = first + second + bits[1] % (n - 2 * first - second + 1)
@@ -161,7 +163,8 @@ def collide(
         spin: s_i + s_j; smooth spheres have no components.
         drag_factor: ratio of physical velocities to these.
     """
-    d, dtype = relative.shape[-1], relative.dtype
+    d = relative.shape[-1]
+    dtype = relative.dtype
     g = [relative[:, k] for k in range(d)]
     square = sum(x * x for x in g)
     speed = jnp.sqrt(jnp.where(square > 0, square, 1.0))
@@ -252,13 +255,15 @@ def change_subsets(
             belong to the subset. It returns the changed rows and the sums.
         zero: sums without changes.
     """
-    n, parts = len(particles), num_subsets(len(particles))
+    n = len(particles)
+    parts = num_subsets(len(particles))
     size = -(-n // parts)
 
     def change_one(i: Int[Array, ""], carry: tuple[Array, Sums]) -> tuple[Array, Sums]:
         particles, sums = carry
         index = ((first + i) & (2**30 - 1)) % parts
-        begin, end = index * n // parts, (index + 1) * n // parts
+        begin = index * n // parts
+        end = (index + 1) * n // parts
         top = jnp.minimum(begin, n - size)
         row = top + jnp.arange(size, dtype=top.dtype)
         belongs = (row >= begin) & (row < end) & (i < count)

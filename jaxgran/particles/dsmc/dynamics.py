@@ -185,7 +185,8 @@ class DSMCDynamics(AbstractDynamics):
 
         T is then 1, and T_rot that of the scene.
         """
-        scene, (replicas, n, d) = self.scene, self.shape
+        scene = self.scene
+        (replicas, n, d) = self.shape
         words = jax.random.bits(key, (2,), jnp.uint32)
         key = jax.random.fold_in(threefry_key(words), 2**32 - 1)
         velocity = maxwellian_velocities(key, self.shape)
@@ -258,7 +259,8 @@ class DSMCDynamics(AbstractDynamics):
         return dsmc_records(self, state)
 
     def to_lab_frame(self, state: DSMCState) -> tuple[Array, Array, Array | None]:
-        d, particles = self.scheme.dimension, state.shown.particles
+        d = self.scheme.dimension
+        particles = state.shown.particles
         decay = drag_decay(self.scene.drag, state.time)
         velocity = particles[..., :d] * decay.velocity
         spin = None
@@ -281,7 +283,8 @@ class DSMCDynamics(AbstractDynamics):
         self, gas: DSMCGas, ds: Float[Array, "*replicas"]
     ) -> Float[Array, "*replicas"]:
         """Return the number of wall impacts in a step of a sphere of the speed `FASTEST_SPEED`."""
-        walls, d = self.scene.walls, self.scheme.dimension
+        walls = self.scene.walls
+        d = self.scheme.dimension
         speed = FASTEST_SPEED * jnp.sqrt(gas.temperature)
         true_speed = speed * drag_decay(self.scene.drag, gas.clock).velocity
         eps = walls.law.restitution(true_speed)[..., None]
@@ -403,7 +406,8 @@ class DSMCDynamics(AbstractDynamics):
         state within a step is as accurate as at its end. `largest` are the largest numbers of
         subsets of all replicas.
         """
-        scheme, before = self.scheme, gas
+        scheme = self.scheme
+        before = gas
         key = jax.random.fold_in(key, gas.steps)
         dt = share * self.full_step(gas)
         kicks, walls = zip(subsets, largest, strict=True)
@@ -448,10 +452,13 @@ class DSMCDynamics(AbstractDynamics):
         kicked, largest = counts
         if kicked is None or largest is None:
             return gas
-        d, parts = self.scheme.dimension, num_subsets(self.scheme.num_particles)
+        d = self.scheme.dimension
+        parts = num_subsets(self.scheme.num_particles)
         growth = self.kick_growth(clock, dt, float(place))
-        key, at_rest = jax.random.fold_in(key, 2 + place), self.scene.walls is None
-        size, time = jnp.sqrt(growth / 2 * (parts / kicked)), gas.clock
+        key = jax.random.fold_in(key, 2 + place)
+        at_rest = self.scene.walls is None
+        size = jnp.sqrt(growth / 2 * (parts / kicked))
+        time = gas.clock
 
         def kick(i: Array, rows: Array, belongs: Array) -> tuple[Array, Array]:
             v = rows[:, :d]
@@ -470,13 +477,16 @@ class DSMCDynamics(AbstractDynamics):
         self, gas: DSMCGas, key: PRNGKeyArray, dt: Float[Array, ""], chance: Float[Array, ""]
     ) -> tuple[Float[Array, "N components"], Outcome, EnergyGains]:
         """Return the particles after the collisions of a step, sums over them, and gains."""
-        d, first, second = self.scheme.dimension, self.scheme.first, self.scheme.second
+        d = self.scheme.dimension
+        first = self.scheme.first
+        second = self.scheme.second
         bits = jax.random.bits(key, (2, first + second + 2), jnp.uint32)
         i, j, k = draw_pairs(bits[:, -2:].ravel(), self.scheme)
         index = jnp.concatenate([i, j, k])
         options = {"mode": "promise_in_bounds", "unique_indices": True}
         old = gas.particles.at[index].get(**options)
-        v, spin = old[:, :d], old[:, 2 * d :]
+        v = old[:, :d]
+        spin = old[:, 2 * d :]
         # Collisions happen at the middle of the step, on average: x - v t changes by -kick t.
         middle = gas.clock + dt / 2
         ceiling = CEILING * jnp.sqrt(gas.temperature)
@@ -495,7 +505,8 @@ class DSMCDynamics(AbstractDynamics):
 
         firsts = v[:first] - v[first : 2 * first]
         gains, one = collided(firsts, spin[:first] + spin[first : 2 * first], bits[:, :first])
-        kick, turn = one.kick, one.spin_change
+        kick = one.kick
+        turn = one.spin_change
         seconds = v[:second] + kick[:second] - v[2 * first :]
         second_spins = spin[:second] + turn[:second] + spin[2 * first :]
         more, two = collided(seconds, second_spins, bits[:, first:-2])
@@ -523,10 +534,12 @@ class DSMCDynamics(AbstractDynamics):
 
         Returns the particles and the gains.
         """
-        d, middle = self.scheme.dimension, gas.clock + dt / 2
+        d = self.scheme.dimension
+        middle = gas.clock + dt / 2
         axis = (gas.steps % d).astype(jnp.int32)
         across = (jnp.arange(d) == axis).astype(particles.dtype)[None]
-        key, (drawn, largest) = jax.random.fold_in(key, 1), counts
+        key = jax.random.fold_in(key, 1)
+        (drawn, largest) = counts
         parts = num_subsets(len(particles))
 
         def hit_rows(i: Array, rows: Array, belongs: Array) -> tuple[Array, EnergyGains]:
@@ -538,17 +551,21 @@ class DSMCDynamics(AbstractDynamics):
                 scene: ReducedScene, decay: DragDecay, faster: Array, turning: Array
             ) -> tuple[Array, tuple[Array, Array]]:
                 """Return the gains, and velocities and spins after impacts."""
-                velocity, spin = rows[:, :d] * faster, rows[:, 2 * d :] * turning
-                walls, surface = scene.walls, scene.surface
+                velocity = rows[:, :d] * faster
+                spin = rows[:, 2 * d :] * turning
+                walls = scene.walls
+                surface = scene.surface
                 frequency = walls.frequency[axis]
                 normal = jnp.sum(velocity * across, axis=1)
-                speed, outwards = jnp.abs(normal), jnp.sign(normal)[:, None] * across
+                speed = jnp.abs(normal)
+                outwards = jnp.sign(normal)[:, None] * across
                 eps = walls.law.restitution(jnp.where(speed > 0, speed * decay.velocity, 1.0))
                 ratio = wall_impact_ratio(eps, frequency / collision_rate(0.0, d), d)
                 often = ratio * (frequency * (d * sqrt(pi)) * dt) * speed
                 hits = (chance < often) & (speed > 0)
                 push = jnp.where(hits, (1 + eps) * speed, 0.0)
-                kick, spin_change = -push[:, None] * outwards, jnp.zeros_like(spin)
+                kick = -push[:, None] * outwards
+                spin_change = jnp.zeros_like(spin)
                 if surface is not None and walls.surface is not None:
                     eta = surface.eta_on_wall(walls.surface)
                     _, sliding_kick, spin_change = tangential_impulse(
@@ -596,7 +613,8 @@ class DSMCDynamics(AbstractDynamics):
 
         def gained(scene: ReducedScene, log_scales: Float[Array, "energies"]) -> tuple[Array, Any]:
             decay = drag_decay(scene.drag, middle)
-            faster, turning = jnp.exp(log_scales[0]), decay.spin
+            faster = jnp.exp(log_scales[0])
+            turning = decay.spin
             if scene.surface is not None:  # at a given energy a larger inertia has smaller spins
                 inertia = scene.surface.inertia
                 smaller = jnp.sqrt(jax.lax.stop_gradient(inertia) / inertia)
@@ -617,7 +635,8 @@ class DSMCDynamics(AbstractDynamics):
         self, before: DSMCGas, gains: EnergyGains, ds: Array, collisions: Array
     ) -> ExchangeTangents:
         """Return the tangents after a step with some gains by impacts, and the kicks of a drive."""
-        d, scene = self.scheme.dimension, self.scene
+        d = self.scheme.dimension
+        scene = self.scene
         values, by_direction, by_scale = gains
         assert by_direction is not None and by_scale is not None
         if scene.drive is not None:
@@ -649,7 +668,8 @@ def time_left(gas: DSMCGas, until: ArrayLike) -> Float[Array, "*replicas"]:
 @jax.jit
 def dsmc_records(dynamics: DSMCDynamics, state: DSMCState) -> Records:
     """Return the records of a state."""
-    scene, gas = dynamics.scene, state.shown
+    scene = dynamics.scene
+    gas = state.shown
     replicas, n, d = dynamics.shape
     velocity = v = gas.particles[..., :d]
     if scene.walls is None:  # walls stop the gas as a whole

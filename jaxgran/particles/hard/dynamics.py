@@ -126,7 +126,8 @@ class HardDynamics(AbstractSphereDynamics):
         return dataclasses.replace(self, scene=scene, all_elastic=jnp.ones((), bool))
 
     def initial_internal(self, velocity: Float[Array, "n d"], key: PRNGKeyArray) -> HardState:
-        dtype, material = velocity.dtype, self.scene.material
+        dtype = velocity.dtype
+        material = self.scene.material
         # The first window is short: at random positions many spheres are near contact.
         rate = self.scene.collision_frequency
         if self.region is not None:
@@ -166,7 +167,8 @@ class HardDynamics(AbstractSphereDynamics):
 
         Free flight leads there, and the list lives twice as long as one of the current positions.
         """
-        side, container = self.scene.side, self.scene.container
+        side = self.scene.side
+        container = self.scene.container
         speed = jnp.max(fastest(state.velocity, self.replicas))
         life = 0.95 * state.skin / jnp.maximum(speed, jnp.finfo(speed.dtype).tiny)
         time_until_end = time_left(state, end)
@@ -193,7 +195,9 @@ class HardDynamics(AbstractSphereDynamics):
 
     def _overlaps(self, state: SphereState, pairs: Pairs) -> Bool[Array, ""]:
         """Return whether spheres of a start overlap others or a wall by more than rounding."""
-        x, side, container = state.position, self.scene.side, self.scene.container
+        x = state.position
+        side = self.scene.side
+        container = self.scene.container
         separation = x[pairs.i] - x[pairs.j] - pairs.offset
         square = jnp.sum(separation * separation, -1)
         in_use = jnp.arange(len(square)) < pairs.count
@@ -207,8 +211,10 @@ class HardDynamics(AbstractSphereDynamics):
 
         `Segment.retry` is the factor by which the bound on speeds is raised.
         """
-        old, bound_factor = now.state, now.retry
-        time_until_end, scene = time_left(old, end), self.scene
+        old = now.state
+        bound_factor = now.retry
+        time_until_end = time_left(old, end)
+        scene = self.scene
         window = self._window_length(old)
         num_left = jnp.maximum(jnp.ceil(time_until_end / window * (1 - 1e-9)), 1.0)
         duration = time_until_end / num_left
@@ -230,7 +236,8 @@ class HardDynamics(AbstractSphereDynamics):
         fault |= status.flag(status.STALLED, work.num_rounds >= MAX_ROUNDS)
         invalid = self.invalid_block(new, candidates.needed)
         fault = jnp.where(invalid > 0, invalid, fault)
-        accepted, repeat = (fault == status.OK) & ~too_fast, too_fast & (invalid == 0)
+        accepted = (fault == status.OK) & ~too_fast
+        repeat = too_fast & (invalid == 0)
         state = jax.tree.map(partial(jnp.where, accepted), new, old)
         next_duration = jnp.minimum(state.internal.window, time_left(state, end))
         next_position = state.position + state.velocity * next_duration
@@ -254,8 +261,11 @@ class HardDynamics(AbstractSphereDynamics):
             duration: of the window.
             bound: an upper bound on the speeds in each replica during the window.
         """
-        x, v, container = state.position, state.velocity, self.scene.container
-        n, size = len(x), len(x) // len(bound)
+        x = state.position
+        v = state.velocity
+        container = self.scene.container
+        n = len(x)
+        size = len(x) // len(bound)
         # The listed pairs that can touch at the largest speeds are a small part of the list.
         displacement = x[pairs.i] - x[pairs.j] - pairs.offset
         gap = jnp.sqrt(jnp.sum(displacement * displacement, -1)) - 1
@@ -263,7 +273,9 @@ class HardDynamics(AbstractSphereDynamics):
         near, num_near = rows_where(gap < 2 * bound[pairs.i // size] * duration, self.capacity.near)
         real = jnp.arange(self.capacity.near) < num_near
         near = jnp.where(real, near, 0)
-        i, j, offset = pairs.i[near], pairs.j[near], pairs.offset[near]
+        i = pairs.i[near]
+        j = pairs.j[near]
+        offset = pairs.offset[near]
         rows = PairRows(i, j, offset, bound[i // size], real)
 
         free = first_impacts(Paths(x, v, jnp.zeros(n, x.dtype)), rows, duration, container)
@@ -289,13 +301,15 @@ class HardDynamics(AbstractSphereDynamics):
         def to_members(values, new):
             return values.at[candidates.members].set(new, mode="drop")
 
-        impacts, lost = by_replica(work.impacts) // 2, by_replica(work.dissipated)
+        impacts = by_replica(work.impacts) // 2
+        lost = by_replica(work.dissipated)
         wanted = max(0.5 * self.share * len(state.position), MIN_IMPACTS)
         num_impacts = jnp.sum(impacts)
         if work.wall_impacts is not None:  # each of one sphere, not of two
             num_impacts = num_impacts + jnp.sum(work.wall_impacts) / 2
         ratio = jnp.clip((wanted / jnp.maximum(num_impacts, 1)) ** WINDOW_EXPONENT, 0.5, 1.5)
-        paths, internal = work.paths, state.internal
+        paths = work.paths
+        internal = state.internal
         regularised = internal.regularised + by_replica(work.regularised) // 2
         rotational_gain = None
         if work.rotational_gain is not None:
@@ -342,7 +356,8 @@ class HardDynamics(AbstractSphereDynamics):
 
         Time and window are those before the window; the velocities may already have had kicks.
         """
-        counted_key, replicas = state.internal.key, self.replicas
+        counted_key = state.internal.key
+        replicas = self.replicas
         if counted_key is None:
             return state
         variance = drive_variance(self.scene, state.time + state.time_rest, duration, place)
@@ -359,7 +374,8 @@ class HardDynamics(AbstractSphereDynamics):
         """Return a length with which the kicks of a window are small beside the velocities."""
         if self.scene.material.drive is None:
             return state.internal.window
-        lowest, time = jnp.min(temperature(state.velocity, self.replicas)), state.time
+        lowest = jnp.min(temperature(state.velocity, self.replicas))
+        time = state.time
         growth = 2 * drive_variance(self.scene, time + state.time_rest, jnp.ones_like(lowest), 0.0)
         safe_growth = jnp.where(growth > 0, growth, 1.0)
         longest = jnp.where(growth > 0, MAX_KICK * lowest / safe_growth, jnp.inf)
@@ -374,7 +390,9 @@ class HardDynamics(AbstractSphereDynamics):
         duration: Array,
     ) -> ExchangeTangents:
         """Return the tangents after a window, from the states before and after it."""
-        tangents, scene, replicas = old.tangents, self.scene, self.replicas
+        tangents = old.tangents
+        scene = self.scene
+        replicas = self.replicas
         material = scene.material
         lost = _sum_by_replica(work.dissipated, candidates, replicas)
         impacts = _sum_by_replica(work.impacts, candidates, replicas)
@@ -391,11 +409,13 @@ class HardDynamics(AbstractSphereDynamics):
             before.append(material.surface.inertia / 2 * spins)
             gained.append(_sum_by_replica(work.rotational_gain, candidates, replicas))
         num_energies = len(gained)
-        by_direction, by_scale = gains[:-num_energies], gains[-num_energies:]
+        by_direction = gains[:-num_energies]
+        by_scale = gains[-num_energies:]
         if material.drive is not None:
 
             def heating(material: ReducedScene) -> Array:
-                changed, start = scene._replace(material=material), old.time + old.time_rest
+                changed = scene._replace(material=material)
+                start = old.time + old.time_rest
                 first, second = (drive_variance(changed, start, duration, k) for k in (0.0, 1.0))
                 return old.velocity.size / replicas / 2 * (first + second)
 
@@ -438,7 +458,9 @@ def hard_records(state: SphereState, scene: SphereScene, replicas: int) -> Recor
     In a scene with elements the dissipated energy includes all losses in impacts and to drag.
     """
     values, velocity = common_values(state, scene, replicas)
-    material, tangents, (n, d) = scene.material, state.tangents, velocity.shape[1:]
+    material = scene.material
+    tangents = state.tangents
+    (n, d) = velocity.shape[1:]
     values["regularised"] = 2 / n * state.internal.regularised
     if material.has_elements:
         values |= _values_with_elements(state, scene, values)
@@ -461,9 +483,11 @@ def _values_with_elements(
 ) -> dict[str, Array]:
     """Return the records that drag changes, and those of rotation."""
     replicas = len(values["temperature"])
-    n, d = len(state.velocity) // replicas, state.velocity.shape[1]
+    n = len(state.velocity) // replicas
+    d = state.velocity.shape[1]
     decay = drag_decay(scene.drag_rates, state.time + state.time_rest)
-    velocity_factor, spin_factor = decay.velocity, decay.true_spin
+    velocity_factor = decay.velocity
+    spin_factor = decay.true_spin
     initial = kinetic_energy(state.first_velocity, replicas) / n
     lost = initial - velocity_factor**2 * (initial - state.dissipated / n)
     changed = {

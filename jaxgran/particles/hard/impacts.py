@@ -73,16 +73,21 @@ def impact_effect(
     tangent knows neither the positions of walls nor those of spheres, but only how often a gas
     meets the walls: energies at walls have a factor of value 1 that carries this dependence.
     """
-    material, speed = scene.material, impact.speed
-    law, surface, share = material.law, material.surface, 0.5
+    material = scene.material
+    speed = impact.speed
+    law = material.law
+    surface = material.surface
+    share = 0.5
     if axis is not None:
-        law, share = material.walls.law, 1.0  # a wall takes no part of the change of velocity
+        law = material.walls.law
+        share = 1.0  # a wall takes no part of the change of velocity
     decay = drag_decay(scene.drag_rates, impact.time)
     law_speed = speed * 0.5**0.5  # the law's unit of speed is sqrt(2)
     eps = law.restitution(law_speed * decay.velocity)
     eps = jnp.where(impact.elastic, 1.0, eps)
     push = share * (1 + eps) * speed
-    kick, lost = -push[:, None] * impact.normal, share**2 / 2 * (1 - eps**2) * speed**2
+    kick = -push[:, None] * impact.normal
+    lost = share**2 / 2 * (1 - eps**2) * speed**2
     spin_change = rotational_gain = None
     if surface is not None and impact.spin is not None:
         spin_change = jnp.zeros_like(impact.spin)
@@ -96,7 +101,8 @@ def impact_effect(
                 impact.relative, spin, impact.normal, ~impact.elastic, eta, surface, push
             )
             with_half = sideways + 0.5 / share * sliding_kick
-            kick, lost = kick + sliding_kick, lost - share * jnp.sum(sliding_kick * with_half, -1)
+            kick = kick + sliding_kick
+            lost = lost - share * jnp.sum(sliding_kick * with_half, -1)
             spin_change = added_spin / spin_factor
             doubled = impact.spin * 2 * share + spin_change
             rotational_gain = surface.inertia / 2 * jnp.sum(spin_change * doubled, -1)
@@ -213,7 +219,9 @@ def execute_impacts(
     def of_members(values):
         return values.at[candidates.members].get(mode="fill", fill_value=0.0)
 
-    internal, tangents, start_time = state.internal, state.tangents, state.time + state.time_rest
+    internal = state.internal
+    tangents = state.tangents
+    start_time = state.time + state.time_rest
     spin = None if internal.spin is None else of_members(internal.spin)
     x, v, listed = (of_members(values) for values in (state.position, state.velocity, listed))
     paths = Paths(x, v, -of_members(internal.age), spin)
@@ -222,14 +230,19 @@ def execute_impacts(
     T = jnp.maximum(T, jnp.finfo(T.dtype).tiny)
     contact_duration = contact_time / (scene.collision_frequency * jnp.sqrt(T))
     contact_duration = contact_duration[jnp.minimum(candidates.replica, replicas - 1)]
-    rows, slots = candidates.rows, jnp.arange(len(v), dtype=jnp.int32)
-    a, b, num_rows = rows.a, rows.b, len(rows.a)
+    rows = candidates.rows
+    slots = jnp.arange(len(v), dtype=jnp.int32)
+    a = rows.a
+    b = rows.b
+    num_rows = len(rows.a)
     index = jnp.arange(num_rows, dtype=jnp.int32)
 
     def one_round(work: ImpactWork) -> ImpactWork:
         paths = work.paths
         next_impacts = first_impacts(paths, rows, duration, scene.container)
-        times, first, final = next_impacts.times, next_impacts.first, next_impacts.final
+        times = next_impacts.times
+        first = next_impacts.first
+        final = next_impacts.final
         executable = jnp.isfinite(times)
         for k in (a, b):
             executable &= (times == first[k]) & (times == final[k])
@@ -253,16 +266,20 @@ def execute_impacts(
             gains = gains.at[..., :num_rows].add(more)
 
         # From the rows of pairs to the slots of their spheres.
-        unpaired, row = row == num_rows, jnp.minimum(row, num_rows - 1)
+        unpaired = row == num_rows
+        row = jnp.minimum(row, num_rows - 1)
         hit = executable[row] & ((a[row] == slots) | (b[row] == slots))
         sign = jnp.where(hit, jnp.where(a[row] == slots, 1.0, -1.0), 0.0)
         effect = jax.tree.map(lambda x: x[row], effect)
         effect = effect._replace(kick=sign[:, None] * effect.kick)
-        s, too_soon = jnp.where(hit, s[row], 0.0), too_soon[row]
+        s = jnp.where(hit, s[row], 0.0)
+        too_soon = too_soon[row]
         x = paths.x - effect.kick * s[:, None]
-        impacts, wall_impacts = work.impacts + hit, work.wall_impacts
+        impacts = work.impacts + hit
+        wall_impacts = work.wall_impacts
         regularised = work.regularised + (hit & too_soon)
-        wall_times, axis = next_impacts.wall_times, next_impacts.wall_axis
+        wall_times = next_impacts.wall_times
+        axis = next_impacts.wall_axis
         if wall_times is not None and axis is not None and wall_impacts is not None:
             at_wall = unpaired & jnp.isfinite(wall_times)
             at_wall &= (wall_times == first) & (wall_times == final)
@@ -280,14 +297,17 @@ def execute_impacts(
                 more = exchange_gains(scene, tangents, events, at_wall, axis)
                 gains = gains.at[..., num_rows:].add(more)
             effect = jax.tree.map(partial(_where_rows, at_wall), on_wall, effect)
-            s, hit = jnp.where(at_wall, wall_s, s), hit | at_wall
+            s = jnp.where(at_wall, wall_s, s)
+            hit = hit | at_wall
             after = paths.x + paths.v * s[:, None] - (paths.v + effect.kick) * s[:, None]
             x = _where_rows(at_wall, after, x)
             wall_impacts = wall_impacts + at_wall
             # An impact of two spheres counts twice.
             regularised = regularised + 2 * (at_wall & too_soon)
 
-        v, spin, rotational_gain = paths.v + effect.kick, paths.spin, work.rotational_gain
+        v = paths.v + effect.kick
+        spin = paths.spin
+        rotational_gain = work.rotational_gain
         if spin is not None and rotational_gain is not None:
             spin = spin + _where_rows(hit, effect.spin_change, jnp.zeros_like(spin))
             rotational_gain = rotational_gain + jnp.where(hit, effect.rotational_gain, 0.0)
@@ -309,7 +329,8 @@ def execute_impacts(
     def unfinished(work: ImpactWork):
         return work.pending & (work.num_rounds < MAX_ROUNDS)
 
-    counts, zeros = jnp.zeros_like(slots), jnp.zeros(len(slots), paths.x.dtype)
+    counts = jnp.zeros_like(slots)
+    zeros = jnp.zeros(len(slots), paths.x.dtype)
     shape = 0, 1, num_rows
     if tangents is not None:
         num_directions, num_energies, _ = tangents.energies.shape

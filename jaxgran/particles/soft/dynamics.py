@@ -73,7 +73,6 @@ RECOVERY_BLOCKS = 200
 REACH_MARGIN = 1.5
 """Largest distance of a sphere in a block, over the free flight of the fastest sphere."""
 
-
 LOSS, COLLISIONS, ROTATION = range(3)
 """Changes of which tangents have rates: energy lost, collisions, energy gained by rotation."""
 
@@ -106,6 +105,25 @@ class SoftRetry(NamedTuple):
 
     extra: Bool[Array, "n"]
     reach_factor: Float[Array, ""]
+
+
+class IntegratedBlock(NamedTuple):
+    """A block, and what decides whether it is accepted.
+
+    Attributes:
+        state: after the block, at the time before it.
+        lost: energy lost in contacts and to drag.
+        exchanged: work of the elastic forces, with all its parts counted as positive.
+        unexpected: particles that touched another one or a wall, although not all of their
+            neighbours belong to the candidates.
+        max_square_move: square of the largest distance that a member moved.
+    """
+
+    state: SphereState
+    lost: Float[Array, "replicas"]
+    exchanged: Float[Array, "replicas"]
+    unexpected: Bool[Array, "n"]
+    max_square_move: Float[Array, ""]
 
 
 class SoftDynamics(AbstractSphereDynamics):
@@ -155,11 +173,13 @@ class SoftDynamics(AbstractSphereDynamics):
 
     def initial_tangents(self, state: SphereState, directions: ReducedScene) -> ContactTangents:
         spin = state.internal.spin
-        changes, spin_tangent = [LOSS, COLLISIONS], None
+        changes = [LOSS, COLLISIONS]
+        spin_tangent = None
         if spin is not None:
             changes.append(ROTATION)
             # Spins of q s^2 = ratio: nan along a ratio that is 0, of which they are a square root.
-            along, ratio = directions.surface.ratio, self.scene.material.surface.ratio
+            along = directions.surface.ratio
+            ratio = self.scene.material.surface.ratio
             growth = jnp.where(along == 0, 0.0, along / ratio)
             spin_tangent = 0.5 * growth[:, None, None] * spin[None]
         rates = RateSums.zero(len(changes), self.replicas, state.velocity.dtype)
@@ -181,7 +201,8 @@ class SoftDynamics(AbstractSphereDynamics):
     def run_blocks(
         self, state: SphereState, listed: Float[Array, "n d"], pairs: Pairs, end: ArrayLike
     ) -> Segment:
-        x, material = state.position, self.scene.material
+        x = state.position
+        material = self.scene.material
         xi, _, touching = overlap(x, pairs.i, pairs.j, pairs.offset)
         touching &= jnp.arange(len(xi)) < pairs.count
         stored = elastic_energy(jnp.where(touching, xi, 0.0), material.law, PAIR)
@@ -199,30 +220,30 @@ class SoftDynamics(AbstractSphereDynamics):
 
     def _run_block(self, now: Segment, listed: Array, pairs: Pairs, end: ArrayLike) -> Segment:
         """Run one block, and accept it if all its contacts were expected and no check failed."""
-        old, retry = now.state, now.retry
+        old = now.state
+        retry = now.retry
         duration, num_left, hottest = self._block_duration(old, end)
         # The fastest sphere of all replicas, which share their blocks.
         speed = jnp.max(fastest(old.velocity, self.replicas))
         # At rest the first reach is 0, and the next one is given by the energy in contacts.
         from_contacts = (retry.reach_factor - 1) * jnp.sqrt(hottest)
-        reach = REACH_MARGIN * speed * retry.reach_factor + from_contacts
-        reach = reach * duration
+        reach = (REACH_MARGIN * speed * retry.reach_factor + from_contacts) * duration
         candidates = self._select_candidates(old, pairs, duration, 2 * reach, retry.extra)
-        new, lost, exchanged, unexpected, max_square_move = self._integrate_block(
-            old, candidates, duration
-        )
-        new = advance_time(new, duration, end, num_left <= 1)
+        block = self._integrate_block(old, candidates, duration)
+        new = advance_time(block.state, duration, end, num_left <= 1)
 
         # A sphere outside the candidates was hit, or one went farther than the reach.
-        too_far = max_square_move > reach**2
-        repeat = too_far | jnp.any(unexpected)
+        too_far = block.max_square_move > reach**2
+        repeat = too_far | jnp.any(block.unexpected)
         displacement = jnp.sqrt(jnp.max(jnp.sum((new.position - listed) ** 2, -1)))
-        before, after = (self._energy(state) for state in (old, new))
+        before = self._energy(old)
+        after = self._energy(new)
         total = jnp.where(before > 0, before, 1.0)
-        error = (after - before + lost) / total
-        allowed = WORK_TOLERANCE * exchanged / total + ENERGY_TOLERANCE
+        error = (after - before + block.lost) / total
+        allowed = WORK_TOLERANCE * block.exchanged / total + ENERGY_TOLERANCE
         settings = new.internal
-        num_good, drift = settings.num_good + 1, settings.drift + error
+        num_good = settings.num_good + 1
+        drift = settings.drift + error
         # The step is doubled again after enough good blocks.
         recovers = (num_good >= RECOVERY_BLOCKS) & (settings.refinement > 1)
         settings = settings._replace(
@@ -246,7 +267,7 @@ class SoftDynamics(AbstractSphereDynamics):
             state=state._replace(status=fault, needed=needed),
             stale=accepted & (displacement + 2 * speed * duration > 0.5 * old.skin),
             retry=SoftRetry(
-                extra=jnp.where(accepted, False, retry.extra | unexpected),
+                extra=jnp.where(accepted, False, retry.extra | block.unexpected),
                 reach_factor=jnp.where(accepted, 1.0, enlarged),
             ),
         )
@@ -270,19 +291,25 @@ class SoftDynamics(AbstractSphereDynamics):
             margin: largest change of a pair's distance during the block.
             extra: further particles that are known to touch another one.
         """
-        position, velocity, container = state.position, state.velocity, self.scene.container
-        n, max_near = len(position), self.capacity.near
+        position = state.position
+        velocity = state.velocity
+        container = self.scene.container
+        n = len(position)
+        max_near = self.capacity.near
         displacement = position[pairs.i] - position[pairs.j] - pairs.offset
         near = jnp.sum(displacement * displacement, -1) < (1 + margin) ** 2
         near &= jnp.arange(near.size) < pairs.count
         rows, num_near = rows_where(near, max_near)
         real = jnp.arange(max_near) < num_near
-        i, j, offset = pairs.i[rows], pairs.j[rows], pairs.offset[rows]
+        i = pairs.i[rows]
+        j = pairs.j[rows]
+        offset = pairs.offset[rows]
         displacement = displacement[rows]
 
         # Which of them come closer than a diameter in free flight.
         relative = velocity[i] - velocity[j]
-        approach, speed2 = jnp.sum(displacement * relative, -1), jnp.sum(relative * relative, -1)
+        approach = jnp.sum(displacement * relative, -1)
+        speed2 = jnp.sum(relative * relative, -1)
         closest = jnp.clip(-approach / jnp.where(speed2 > 0, speed2, 1.0), 0.0, duration)
         distance2 = jnp.sum(displacement * displacement, -1)
         touching = real & (distance2 + (2 * approach + speed2 * closest) * closest < 1.0)
@@ -294,7 +321,8 @@ class SoftDynamics(AbstractSphereDynamics):
         # The particles that would touch, those near them, and all pairs near these.
         alone = jnp.zeros(n, bool)
         if container is not None:
-            before, after = position, position + velocity * duration
+            before = position
+            after = position + velocity * duration
             alone = extra | wall_overlap(container, before)[2] | wall_overlap(container, after)[2]
         active = mark_ends(extra | alone, touching)
         active = mark_ends(active, real & (active[i] | active[j]))
@@ -302,7 +330,9 @@ class SoftDynamics(AbstractSphereDynamics):
         rows, real, members, (a, b), counts = select_members(
             selected, i, j, alone, self.capacity[3:]
         )
-        i, j, offset = i[rows], j[rows], offset[rows]
+        i = i[rows]
+        j = j[rows]
+        offset = offset[rows]
         return ContactCandidates(
             members=members,
             a=a,
@@ -317,7 +347,8 @@ class SoftDynamics(AbstractSphereDynamics):
     def _block_duration(self, state: SphereState, end: ArrayLike) -> tuple[Array, Array, Array]:
         """Return the duration of the next block, the number of blocks of this length until the end,
         and the temperature of the hottest replica, with the energy in its contacts."""
-        scene, velocity = self.scene, centred(state.velocity, self.replicas)
+        scene = self.scene
+        velocity = centred(state.velocity, self.replicas)
         if not scene.galilean_invariant:  # walls and drag do not move with the centre of mass
             velocity = state.velocity.reshape(velocity.shape)
         # Without the energy in contacts a step would lengthen while all energy is stored there.
@@ -326,7 +357,8 @@ class SoftDynamics(AbstractSphereDynamics):
         if state.internal.spin is not None:
             hottest_spins = rotational_temperature(scene, state.internal.spin, self.replicas)
             hottest = jnp.maximum(hottest, jnp.max(hottest_spins))
-        shortest_contact, material = scene.contact_duration, scene.material
+        shortest_contact = scene.contact_duration
+        material = scene.material
         if material.walls is not None:  # durations go as alpha^(-2/5) v^(-1/5)
             on_wall = shortest_contact * (material.law.alpha / material.walls.law.alpha) ** 0.4
             shortest_contact = jnp.minimum(shortest_contact, on_wall)
@@ -339,15 +371,11 @@ class SoftDynamics(AbstractSphereDynamics):
 
     def _integrate_block(
         self, state: SphereState, candidates: ContactCandidates, duration: Array
-    ) -> tuple[SphereState, Array, Array, Bool[Array, "n"], Array]:
-        """Return the state after a block, at its old time, and what decides whether it is accepted.
-
-        That is, by replica, the energy lost in contacts and to drag, and the work of the elastic
-        forces, with all its parts counted as positive; the particles that touched another one or a
-        wall although not all of their neighbours belong to the candidates; and the square of the
-        largest distance that a member moved.
-        """
-        scene, replicas, members = self.scene, self.replicas, candidates.members
+    ) -> IntegratedBlock:
+        """Integrate the candidates, and let all others fly."""
+        scene = self.scene
+        replicas = self.replicas
+        members = candidates.members
         n = len(state.position)
         replica_of_particle = jnp.arange(n) // (n // replicas)
         replica_of_member = jnp.minimum(members // (n // replicas), replicas - 1)
@@ -403,9 +431,12 @@ class SoftDynamics(AbstractSphereDynamics):
         def sum_pairs(values: Array) -> Shaped[Array, "replicas"]:
             return jnp.zeros(replicas, values.dtype).at[candidates.replica].add(values)
 
-        lost, exchanged, stored = map(sum_pairs, (pairs.dissipated, pairs.exchanged, pairs.stored))
+        lost = sum_pairs(pairs.dissipated)
+        exchanged = sum_pairs(pairs.exchanged)
+        stored = sum_pairs(pairs.stored)
         partners = members[jnp.stack([candidates.a, candidates.b], 1)]
-        nowhere, surprise = jnp.zeros(n, bool), pairs.touched & ~candidates.expected
+        nowhere = jnp.zeros(n, bool)
+        surprise = pairs.touched & ~candidates.expected
         touching = mark(nowhere, pairs.touching[:, None], partners)
         unexpected = mark(nowhere, surprise[:, None], partners)
         if walls is not None:
@@ -430,7 +461,13 @@ class SoftDynamics(AbstractSphereDynamics):
         if tangents is not None:
             new = new._replace(tangents=tangents._replace(free=~touching))
             new = new._replace(tangents=self._project_if_due(state, new, lost, begun, duration))
-        return new, lost_with_drag, exchanged, unexpected, jnp.max(jnp.sum(moved**2, -1))
+        return IntegratedBlock(
+            state=new,
+            lost=lost_with_drag,
+            exchanged=exchanged,
+            unexpected=unexpected,
+            max_square_move=jnp.max(jnp.sum(moved**2, -1)),
+        )
 
     def _energy(self, state: SphereState) -> Float[Array, "replicas"]:
         energy = kinetic_energy(state.velocity, self.replicas)
@@ -446,19 +483,24 @@ class SoftDynamics(AbstractSphereDynamics):
 
         `lost` and `begun` are the energy lost in contacts, and the number of those that began.
         """
-        scene, replicas, tangents = self.scene, self.replicas, new.tangents
+        scene = self.scene
+        replicas = self.replicas
+        tangents = new.tangents
         velocity = peculiar_velocity(scene, new.velocity, replicas)
-        T, velocity = observables.temperature(velocity), velocity.reshape(new.velocity.shape)
+        T = observables.temperature(velocity)
+        velocity = velocity.reshape(new.velocity.shape)
         energy = kinetic_energy(velocity, replicas)
         passed = duration * jnp.sqrt(T)
-        stored, trend = new.internal.elastic, cooling_trend(scene, T)
+        stored = new.internal.elastic
+        trend = cooling_trend(scene, T)
         collisions = 2 * replicas / len(new.position) * begun
         amounts = [lost, collisions]
         trends = [(energy + stored) * trend * duration, passed]
         spin = new.internal.spin
         if spin is not None:
             # In contacts rotation gained its change less that by drag.
-            first, last = (kinetic_energy(s, replicas) for s in (old.internal.spin, spin))
+            first = kinetic_energy(old.internal.spin, replicas)
+            last = kinetic_energy(spin, replicas)
             gain = last - first
             if (drag := scene.drag_rates) is not None:
                 gain += drag.rotational_rate * duration * (first + last)
@@ -534,7 +576,8 @@ def _material_by_replica(
     Velocities that are (1 + c/2) times as large in the same material are those of a slower clock
     in the material for spheres that are (1 - c/2) times as fast.
     """
-    c, one = tangents.log_temperature, jnp.ones_like(tangents.elapsed)
+    c = tangents.log_temperature
+    one = jnp.ones_like(tangents.elapsed)
     by_clock = jax.jvp(partial(_faster, material), (one,), (-0.5 * one,))[1]
     rows = jax.tree.map(lambda x: jnp.broadcast_to(x, c.shape[1:]), material)
     slopes = jax.tree.map(
@@ -589,7 +632,9 @@ def soft_records(state: SphereState, scene: SphereScene, replicas: int) -> Recor
         values["rotational_temperature"] = rotational_temperature(scene, spin, replicas)
     if state.tangents is None:
         return Records(values, {}, {})
-    tangents, T, U = state.tangents, values["temperature"], values["elastic_energy"]
+    tangents = state.tangents
+    T = values["temperature"]
+    U = values["elastic_energy"]
     cooling = cooling_rate(scene, tangents, T)
     projected = tangents.projected(velocity.reshape(state.velocity.shape))
     c = projected.log_temperature
