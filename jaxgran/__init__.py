@@ -10,7 +10,8 @@ The examples in the docstrings use these definitions:
 >>> cooled = jaxgran.cool(gas, times)
 >>> error = 0.01 * cooled.temperature
 >>> curve = jaxgran.CoolingCurve(times, cooled.temperature, temperature_error=error)
->>> result = jaxgran.fit(gas, curve)  # estimates A
+>>> measurement = jaxgran.Measurement(gas, curve, num_particles=10**6)
+>>> result = jaxgran.fit(measurement)  # estimates A
 """
 
 from importlib import import_module
@@ -21,19 +22,17 @@ from jaxgran._utils.validation import Domain as Domain
 from jaxgran.data.curve import CoolingCurve as CoolingCurve
 from jaxgran.data.curve import Particles as Particles
 from jaxgran.data.curve import Run as Run
-from jaxgran.data.curve_file import DropTest as DropTest
-from jaxgran.data.curve_file import read_absent as read_absent
 from jaxgran.data.curve_file import read_curve as read_curve
-from jaxgran.data.curve_file import read_drop_test as read_drop_test
-from jaxgran.data.curve_file import read_gas as read_gas
-from jaxgran.data.curve_file import read_priors as read_priors
 from jaxgran.data.curve_file import write_curve as write_curve
+from jaxgran.data.drop_test import DropTest as DropTest
+from jaxgran.data.measurement import Measurement as Measurement
+from jaxgran.data.measurement import read_measurement as read_measurement
 from jaxgran.data.particles import read_particles as read_particles
-from jaxgran.fitting.diagnosis import Diagnosis as Diagnosis
-from jaxgran.fitting.diagnosis import diagnose as diagnose
-from jaxgran.fitting.diagnosis import log_likelihood as log_likelihood
+from jaxgran.fitting.alternatives import Alternative as Alternative
 from jaxgran.fitting.fit import fit as fit
+from jaxgran.fitting.learnt_law import RestitutionBand as RestitutionBand
 from jaxgran.fitting.learnt_law import restitution_band as restitution_band
+from jaxgran.fitting.likelihood import log_likelihood as log_likelihood
 from jaxgran.fitting.result import Fit as Fit
 from jaxgran.models.base import AbstractModel as AbstractModel
 from jaxgran.models.base import Limitation as Limitation

@@ -89,19 +89,18 @@ def _draw_with_errors(axes: Axes, curve: CoolingCurve, name: str, **style: Any) 
     axes.set(xscale="log", yscale="log", ylabel=LABELS[name])
 
 
-def plot_fit(result: Fit, curve: CoolingCurve, axes: Any = None) -> np.ndarray:
+def plot_fit(result: Fit, axes: Any = None) -> np.ndarray:
     """Plot the measured T with error bars, the fitted T, power laws as guides, and the residuals.
 
     Args:
-        result: of `jaxgran.fit`.
-        curve: the measured curve.
+        result: of `jaxgran.fit`, of one curve.
         axes: two matplotlib axes, for T and for the residuals; by default those of a new figure.
 
     Returns:
         Both axes, shape (2,).
 
     Raises:
-        ValueError: if `axes` are not two.
+        ValueError: if `axes` are not two, or for a fit of several measurements or of a drop test.
     """
     if axes is None:
         from matplotlib import pyplot
@@ -114,33 +113,32 @@ def plot_fit(result: Fit, curve: CoolingCurve, axes: Any = None) -> np.ndarray:
             f"axes must be two, for T and for the residuals, got shape {axes.shape}. Make them by "
             "matplotlib.pyplot.subplots(2, sharex=True)."
         )
-    _draw_fit(axes, result, curve, "temperature")
-    T = np.asarray(curve.temperature)
+    _draw_fit(axes, result, "temperature")
+    T = np.asarray(_measured(result).temperature)
     axes[0].set_ylim(0.6 * float(T[-1]), 1.6 * float(T.max()))
     _draw_power_laws(axes[0], result.curve)
     axes[0].legend(frameon=False, loc="lower left")
     return axes
 
 
-def save_fit(result: Fit, curve: CoolingCurve, title: str, path: str | Path) -> None:
+def save_fit(result: Fit, title: str, path: str | Path) -> None:
     """Write the picture of a fit: `plot_fit`, with panels for T_rot and <dr^2> if they were fitted.
 
     Args:
-        result: of `jaxgran.fit`.
-        curve: the measured curve.
+        result: of `jaxgran.fit`, of one curve.
         title: above the picture.
         path: of the file; its suffix is the format, PNG without one.
     """
     names = "rotational_temperature", "displacement"
-    further = [name for name in names if name in result.comparison.residuals]
+    further = [name for name in names if name in result.residuals.get("", {})]
     width = max(8.0, 4.0 + 4.0 * len(further))
     figure = Figure(figsize=(width, 6.4))  # a constrained layout draws it twice, in half a second
     figure.subplots_adjust(0.8 / width, 0.08, 1 - 0.15 / width, 0.93, 0.25, 0.08)
     heights = {"height_ratios": [3, 1]}
     axes = figure.subplots(2, 1 + len(further), sharex=True, squeeze=False, gridspec_kw=heights)
-    plot_fit(result, curve, axes[:, 0])
+    plot_fit(result, axes[:, 0])
     for name, panel in zip(further, axes[:, 1:].T, strict=True):
-        _draw_fit(panel, result, curve, name)
+        _draw_fit(panel, result, name)
         corner = "upper left" if name == "displacement" else "lower left"
         panel[0].legend(frameon=False, loc=corner)
     _save(figure, title, path)
@@ -177,20 +175,31 @@ def _save(figure: Figure, title: str, path: str | Path) -> None:
     write_atomically(path, lambda f: figure.savefig(f, dpi=150, format=picture_format))
 
 
-def _draw_fit(axes: Any, result: Fit, curve: CoolingCurve, name: str) -> None:
+def _measured(result: Fit) -> CoolingCurve:
+    if [*result.measurements] != [""]:
+        raise ValueError(
+            f"expected a fit of one curve, got one of {', '.join(result.measurements)}. Draw each "
+            "of these curves, and that of result.curve, by jaxgran.plot_curve."
+        )
+    return result.measurements[""].curve
+
+
+def _draw_fit(axes: Any, result: Fit, name: str) -> None:
     """Draw a measured quantity with error bars, the fitted one and the residuals, at t > 0."""
     top, bottom = axes
+    curve = _measured(result)
     shown = _drawn_indices(curve.times)
-    parts = curve.times, getattr(result.curve, name), result.comparison.residuals[name]
+    parts = curve.times, getattr(result.curve, name), result.residuals[""][name]
     t, computed, residuals = (np.asarray(x)[shown] for x in parts)
-    number, model = np.size(curve.times), result.model.name
+    number = np.size(curve.times)
+    model = result.model_name
     label = "measured" if number <= MAX_DRAWN else f"measured: {t.size} of {number}"
     _draw_with_errors(top, curve, name, fmt="o", ms=3.5, color=INK, label=label, zorder=2)
     top.plot(t, computed, color=colour_of(model), lw=1.8, label=f"{model}, fitted", zorder=3)
     bottom.axhspan(-1, 1, color=COLOURS["guide"], alpha=0.2, lw=0)
     bottom.axhline(0, color=colour_of(model), lw=1.4)
     bottom.plot(t, residuals, "o", ms=3.5, color=INK)
-    bottom.set(xlabel="time t (s)", ylabel="residual / error")
+    bottom.set(xlabel="time t (s)", ylabel="independent residual")
 
 
 def _drawn_indices(times) -> np.ndarray:

@@ -91,19 +91,25 @@ def _import():
 
 
 @pytest.fixture(scope="module")
-def read(tmp_path_factory):
-    """A function that reads the curve of a file of given text or bytes, and rows of numbers."""
-    import jaxgran
-
+def write(tmp_path_factory):
+    """A function that writes a file of given text or bytes, and rows of numbers."""
     path = tmp_path_factory.mktemp("file") / "curve.csv"
 
-    def read(content, *columns):
+    def write(content, *columns):
         for row in zip(*columns, strict=True):
             content += ",".join(f"{x:.17g}" for x in row) + "\n"
         path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        return jaxgran.read_curve(path)
+        return path
 
-    return read
+    return write
+
+
+@pytest.fixture(scope="module")
+def read(write):
+    """A function that reads the curve of a file of given text or bytes, and rows of numbers."""
+    import jaxgran
+
+    return lambda content, *columns: jaxgran.read_curve(write(content, *columns))
 
 
 @pytest.fixture(autouse=True, scope="module")

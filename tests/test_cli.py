@@ -17,6 +17,7 @@ import pytest
 
 import jaxgran
 from jaxgran.cli.main import main
+from jaxgran.data.header import gas_of_header
 from tests.beads import glass_beads
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -49,9 +50,9 @@ def run(capsys):
 def test_cool_writes_the_curve_of_the_package(scene, run):
     status, out, _ = run("cool", "scene.toml", "--until", 10)
     assert status == 0 and "written  cooling.csv\n         cooling.png" in out
-    curve, header = jaxgran.read_curve(scene / "cooling.csv")
-    gas = jaxgran.read_gas(header).replace(dissipative_constant=3e-6)
-    expected = jaxgran.cool(gas, curve.times)
+    measurement = jaxgran.read_measurement(scene / "cooling.csv")
+    curve = measurement.curve
+    expected = jaxgran.cool(measurement.gas, curve.times)
     assert jax.numpy.allclose(curve.temperature, expected.temperature, rtol=1e-12)  # 17 digits
     assert (scene / "cooling.png").read_bytes()[:8] == PNG
     status, _, err = run("cool", "scene.toml", "--until", 10)
@@ -75,9 +76,9 @@ def files(tmp_path_factory):
     """Two curves (errors of 2 %) and a drop test of one material; a drop test of another one."""
     folder, rng = tmp_path_factory.mktemp("measured"), np.random.default_rng(1)
     for name, phi in {"thin": 0.02, "dense": 0.08}.items():
-        text = SCENE.replace("A = 3e-6\n", "").replace("0.05", str(phi))
-        header = dict(line.split(" = ") for line in text.splitlines())
-        gas = jaxgran.read_gas(header).replace(dissipative_constant=3e-6)
+        header = dict(line.split(" = ") for line in SCENE.splitlines()) | {"eta": str(phi)}
+        gas, _ = gas_of_header(header)
+        del header["A"]
         curve = jaxgran.cool(gas, jnp.geomspace(0.1, 50.0, 40))
         noisy = curve.temperature * (1 + 0.02 * rng.normal(size=40))
         rows = jaxgran.CoolingCurve(curve.times, noisy, temperature_error=0.02 * noisy)
@@ -88,6 +89,8 @@ def files(tmp_path_factory):
         eps = np.minimum(eps + 0.004 * rng.normal(size=20), 1.0)
         lines = [f"{v:.6g},{e:.6g},0.004" for v, e in zip(speed, eps, strict=True)]
         (folder / f"{name}.csv").write_text("\n".join(["v,eps,eps_err", *lines]) + "\n")
+    header = "# diameter: 2 mm\n# density: 2500\n# Y: 50 MPa\n# nu: 0.22\n"
+    (folder / "alone.csv").write_text(header + (folder / "drops.csv").read_text())
     return folder
 
 
@@ -137,7 +140,9 @@ def test_several_measurements_are_fitted_jointly(measured, fit):
 def test_a_contradicting_drop_test_is_reported(fit):
     # As many measurements as above, so that the program is compiled already.
     out, answer = fit("thin.csv", "dense.csv", "--drop-test", "others.csv")
-    assert not answer["agree"] and answer["p_value"] < 1e-4
+    # N is not in the files: what speaks against A is that the curves need runs of 5 grains.
+    assert not answer["agree"] and answer["p_value"] < 1e-3
+    assert "thin: the scatter is that of" in out
     assert "contradict each other, or the model" in out
 
 
@@ -174,12 +179,10 @@ def test_curves_with_one_floor_of_noise_are_misfits_not_contradictions(fit):
     assert answer["A_low"] < 3e-6 < answer["A_high"]
 
 
-def test_a_drop_test_stands_alone(measured, fit):
-    header = "# diameter: 2 mm\n# density: 2500\n# Y: 50 MPa\n# nu: 0.22\n"
-    (measured / "alone.csv").write_text(header + (measured / "drops.csv").read_text())
+def test_a_drop_test_stands_alone(fit):
     out, answer = fit("--drop-test", "alone.csv")
     assert_finds_A(answer)
-    assert "drops    alone: 20 impacts" in out and answer["verdict"] == "determined"
+    assert "drops    20 impacts" in out and answer["verdict"] == "determined"
 
 
 def test_a_late_clock_is_told_and_leaves_A_determined(measured, run):
@@ -209,11 +212,11 @@ def test_a_single_curve_begins_with_the_range(measured, fit):
     out, answer = fit("thin.csv", "--absent", "roughness", "drag")
     assert out.startswith(f"A = {answer['A']:.3g} s, 95 % range {answer['A_low']:.3g} to ")
     assert list(answer)[:3] == ["A", "A_low", "A_high"] and answer["verdict"] == "determined"
-    assert "if nothing else is there" in out and "absent: walls, roughness, drag" in out
+    assert "assuming no other effect" in out and "absent: walls, roughness, drag" in out
     assert not any(word in out for word in ("walls that dissipate", "rough grains", "linear drag"))
     out, answer = fit("thin.csv", "--absent", "drag", "--quick", "--explain", "--overwrite")
     assert "alternatives were not compared" in out and answer["A_low"] is None
-    assert "error of A, in per cent" in out and "the model's clock in this scene" in out
+    assert "error of A, in per cent" in out and "the model's cooling rate in this scene" in out
 
 
 BAD_INPUT = {
@@ -237,11 +240,12 @@ BAD_INPUT = {
     "fit thin.csv thin.csv": "given twice",
     "fit thin.csv dense.csv --model dsmc": "fitted with kinetic-theory",
     "fit thin.csv dense.csv --free T0 --set A=3e-6": "share none of these",
-    "fit thin.csv --drop-test dense.csv": "name them v,eps,eps_err",
-    "fit drops.csv": "those of a drop test: give it to read_drop_test, or to --drop-test",
-    "fit --drop-test drops.csv": "the header lacks diameter, density, Y, nu",
-    "fit thin.csv --free A beta_t": "`# beta_t: guess` to the file, or --set beta_t",
-    "fit thin.csv --set beta_t=guess": "asks for a fit of beta_t: add --free A beta_t",
+    "fit thin.csv --drop-test dense.csv": "is a cooling curve. Give it without --drop-test",
+    "fit drops.csv": "the gas of a curve, by gas=... or by jaxgran fit CURVE.csv --drop-test",
+    "fit thin.csv alone.csv": "is a drop test. Give it as --drop-test alone.csv",
+    "fit --drop-test drops.csv": "of this drop test lacks diameter, density, Y, nu",
+    "fit thin.csv --free A beta_t": "Give the header line `# beta_t: guess`",
+    "fit thin.csv --set beta_t=guess": "the value of beta_t is a guess: free it, too",
     "fit thin.csv --set 'T0=2 kg'": "--set: header line T0: 'kg' is not known",
     "fit thin.csv --set youngs=1": "give KEY=VALUE with KEY one of",
     "fit thin.csv --set N=many": "header line N",
@@ -277,7 +281,7 @@ def test_interrupts_and_closed_pipes_end_quietly(scene, monkeypatch, capfd, faul
     def stop(*args, **options):
         raise fault
 
-    monkeypatch.setattr("jaxgran.read_gas", stop)
+    monkeypatch.setattr("jaxgran.choose_model", stop)
     monkeypatch.setattr("os.dup2", lambda *files: None)  # the output goes on after the test
     assert main(["choose", "scene.toml", "--until", "1"]) == code
     assert capfd.readouterr().err == ("interrupted\n" if code else "")

@@ -204,13 +204,12 @@ def corrupted_curves():
     outliers = np.where(np.arange(40) % 20 == 5, 1.2, 1.0)
     for name, T, words in (
         ("outliers", exact * noise * outliers, "far outliers at t ="),
-        ("T rises", (exact * noise)[::-1], "drift"),
+        ("T rises", (exact * noise)[::-1], "scatters more than N equal spheres"),
     ):
         wrong = jaxgran.CoolingCurve(times, T, temperature_error=0.01 * exact)
-        result = jaxgran.fit(gas, wrong, model=THEORY, free=(FREE,))
-        diagnosis = jaxgran.diagnose(result, wrong)
-        said = diagnosis.grade == "not consistent" and words in " ".join(diagnosis.reasons)
-        sigma = float(result.error_budget["measurement"][0])
+        result = jaxgran.fit(jaxgran.Measurement(gas, wrong), model=THEORY, free=FREE)
+        said = result.grade == "not consistent" and words in " ".join(result.reasons)
+        sigma = float(result.standard_error[0])
         off = abs(float(result.estimate[0] - gas.value(FREE))) / sigma if name == "outliers" else 0
         # In standard errors.
         yield name, off if said else np.inf, 3.0

@@ -13,7 +13,8 @@ import pytest
 from matplotlib import pyplot
 
 import jaxgran
-from tests.beads import assert_same, glass_beads
+from experiments.fit.own_model import HaffLaw
+from tests.beads import SI, assert_same, glass_beads, hard_gas
 
 
 @pytest.fixture(scope="module")
@@ -107,6 +108,33 @@ def test_a_curve_is_drawn_in_given_axes(curve):
     assert axes.get_xscale() == axes.get_yscale() == "log"
     assert axes.get_legend_handles_labels()[1] == ["mine"]
     assert jaxgran.plot_curve(curve) is pyplot.gca()
+    pyplot.close("all")
+
+
+def test_a_fit_is_drawn_with_its_residuals():
+    gas = hard_gas(0.9, 0.02, **SI)
+    times = np.geomspace(1.0, 100.0, 20) * float(gas.mean_free_time)
+    T = jaxgran.cool(gas, times, model=HaffLaw()).temperature
+    noisy = T * (1 + 0.01 * np.random.default_rng(0).normal(size=20))
+    curve = jaxgran.CoolingCurve(times, noisy, temperature_error=0.01 * T)
+    result = jaxgran.fit(jaxgran.Measurement(gas, curve), model=HaffLaw(), quick=True)
+    top, bottom = jaxgran.plot_fit(result)
+    points: Any = top.containers[0].get_children()[0]
+    np.testing.assert_array_equal(points.get_ydata(), noisy)
+    np.testing.assert_array_equal(top.lines[1].get_ydata(), result.curve.temperature)
+    drawn: Any = bottom.lines[-1]
+    np.testing.assert_array_equal(drawn.get_ydata(), result.residuals[""]["temperature"])
+    pyplot.close("all")
+    with pytest.raises(ValueError, match=r"axes must be two, .* got shape \(3,\)"):
+        jaxgran.plot_fit(result, np.zeros(3))
+
+
+def test_a_fit_of_several_measurements_is_not_drawn():
+    drops = jaxgran.DropTest([0.1, 0.3], [0.92, 0.9], [0.01, 0.01])
+    measurement = jaxgran.Measurement(glass_beads(), drops)
+    several = jaxgran.fit({"first": measurement, "second": measurement}, quick=True)
+    with pytest.raises(ValueError, match="one curve, got one of first, second. Draw each"):
+        jaxgran.plot_fit(several)
     pyplot.close("all")
 
 

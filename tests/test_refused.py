@@ -24,9 +24,7 @@ T = 0.01 / (1 + TIMES) ** (5 / 3)
 CURVE = jaxgran.CoolingCurve(TIMES, T, temperature_error=0.01 * T)
 FEW = jaxgran.CoolingCurve([0.0, 0.1, 0.2], [0.01, 0.009, 0.008], temperature_error=[0, 1e-4, 1e-4])
 NO_VALUES = jaxgran.CoolingCurve(TIMES, T, displacement_error=T)
-BARE = jaxgran.CoolingCurve([0.1, 0.2, 0.3], [0.01, 0.009, 0.008])
 DROPS = jaxgran.DropTest([0.1, 0.3], [0.92, 0.9], [0.01, 0.01])
-TWO = {"a": DROPS, "b": DROPS}
 DSMC, SOFT = jaxgran.DSMC(100, replicas=2), jaxgran.SoftSpheres(20)
 SPLINE = hard_gas(jaxgran.RestitutionSpline([0.01, 0.03, 0.1, 0.3]), **SI)
 ELASTIC = GAS.replace(dissipative_constant=0.0)
@@ -120,27 +118,23 @@ def choose(*tolerance, **options):
     return jaxgran.choose_model(GAS, [0.1], *tolerance, **options)
 
 
-def fit(gas=GAS, data=CURVE, **options):
-    return jaxgran.fit(gas, data, progress=False, **options)
+def measured(data=CURVE, gas=GAS, **known):
+    return jaxgran.Measurement(gas, data, **known)
 
 
-def likelihood(curve=CURVE, **options):
-    return jaxgran.log_likelihood(GAS, curve, **options)
+def fit(measurement=None, **options):
+    measurement = measured() if measurement is None else measurement
+    return jaxgran.fit(measurement, progress=False, **options)
 
 
-HAFF = {"gas": GRAINS, "model": HaffLaw(), "free": ("coefficient",)}
-"""A fit that compiles in no time."""
-
-
-def chi2(scale):
-    curve = dataclasses.replace(CURVE, temperature=scale * CURVE.temperature)
-    return fit(data=curve, **HAFF).chi2
+HAFF = {"model": HaffLaw(), "free": ("coefficient",)}
+"""A fit of `GRAINS` that compiles in no time."""
 
 
 def slip(field, point, value):
-    """Fit a curve with a number that cannot be measured."""
+    """Return a measurement with a number that cannot be measured."""
     slipped = getattr(CURVE, field).at[point].set(value)
-    return fit(data=dataclasses.replace(CURVE, **{field: slipped}))
+    return measured(dataclasses.replace(CURVE, **{field: slipped}))
 
 
 SCENES = [
@@ -230,7 +224,7 @@ SCENES = [
 ]
 CALLS = [
     (lambda: cool(GAS.replace(mass=[1.0, 2.0])), "mass .* shape .2,.*vmap"),
-    (lambda: fit(GAS.replace(mass=np.ones(4))), "vmap"),
+    (lambda: measured(gas=GAS.replace(mass=np.ones(4))), "vmap"),
     (lambda: cool(model=jaxgran.SoftSpheres), "got the class SoftSpheres"),
     (lambda: cool(model=3), "model must be a jaxgran model, got 3"),
     (lambda: cool(model=SOFT, key=5), "jax.random.key.5., got 5"),
@@ -241,10 +235,35 @@ CALLS = [
     (lambda: cool(times=[]), r"a list of numbers, got shape \(0,\)"),
     (lambda: cool(model=SOFT, save="velocity"), 'a replica, or "particles"'),
     (lambda: cool(save=lambda p: 1), "KineticTheory has no particles"),
-    (lambda: jaxgran.fit(GAS, None), "curve must be a jaxgran.CoolingCurve, got None"),
-    (lambda: jaxgran.fit(None, CURVE), "gas must be a jaxgran.Gas, got None"),
+    # measurements
+    (lambda: measured(None), "data must be a jaxgran.CoolingCurve or a jaxgran.DropTest, got None"),
+    (lambda: measured((TIMES, T)), "Make a curve of arrays by jaxgran.CoolingCurve.t, T."),
+    (lambda: measured(gas=None), "gas must be a jaxgran.Gas, got None"),
+    (lambda: measured(num_particles=-5), "num_particles must be a whole number >= 1, an int, got"),
+    (lambda: measured(replicas=0), "replicas must be a whole number >= 1, an int, got 0"),
+    (lambda: measured(num_particles=10, tracked=20), "tracked must be at most N = 10, got 20"),
+    (lambda: measured(calibration_error=-0.1), "calibration_error must lie in"),
+    (lambda: measured(errors_measured="no"), "errors_measured must be True or False"),
+    (lambda: measured(absent=("gravity",)), "absent must be a tuple of walls, roughness, drag"),
+    (lambda: measured(absent="walls"), "absent must be a tuple of walls, roughness, drag"),
+    (lambda: measured(NO_VALUES), "displacement_error without the values"),
+    (lambda: measured(priors=[(PHI, 0.05, 0.01)]), "priors must be a dictionary of names"),
+    (
+        lambda: measured(priors={"phi": (0.05, 0.01)}),
+        "no float 'phi' in this gas; it has .*, and density",
+    ),
+    (lambda: measured(priors={PHI: 0.05}), r"packing_fraction needs \(value, standard error\)"),
+    (lambda: measured(priors={PHI: (0.05, -0.01)}), "error of packing_fraction must lie in"),
+    (lambda: measured(priors={PHI: (0.05, 0.0)}), "Leave out values that are known exactly"),
+    (lambda: measured(priors={PHI: (1.5, 0.1)}), "priors: packing_fraction must lie in"),
+    (lambda: measured(priors={A: (0.0, 1e-7)}), "lies on the end of its range"),
+    (lambda: measured(DROPS).curve, "a drop test, without a curve"),
+    (lambda: fit(CURVE), "got a CoolingCurve. Make one by jaxgran.read_measurement"),
+    (lambda: fit((TIMES, T)), "got a tuple. Make one by jaxgran.read_measurement"),
+    (lambda: fit({}), "no measurement is given"),
+    (lambda: fit({"a": measured(), "b": CURVE}), "'b' must be a jaxgran.Measurement, got a Cool"),
+    (lambda: fit({"a: b": measured()}), "labels of measurements are texts without"),
     (lambda: SOFT.sized_for(GAS, spare=-1), "spare must lie in"),
-    (lambda: jaxgran.diagnose(None, CURVE), "got NoneType and CoolingCurve"),
     (lambda: cool(model=jaxgran.SoftSpheres(20, start=(1, 2))), "Particles"),
     (
         lambda: cool(OF_TWO, model=jaxgran.HardSpheres(2, start=TOUCHING)),
@@ -280,14 +299,11 @@ CALLS = [
     (lambda: hard_gas(InMetres()), "0.04979 at 0.3 m/s .* leave `reduced`"),
     (lambda: cool(hard_gas(BelowZero(1.0))), "eps = -.* at a speed of"),
     (lambda: cool(hard_gas(BelowZero(jnp.nan))), "must be|must lie"),
-    (lambda: jax.grad(chi2)(1.0), "no derivative .*log_likelihood"),
-    (lambda: jax.eval_shape(jax.jacfwd(jax.jit(chi2)), 1.0), "no derivative in the gas"),
     (lambda: cool(throw="no"), "throw must be True or"),
     (lambda: jaxgran.cool(GAS, [0.1], progress=5), "must be True"),
     (lambda: jaxgran.DropTest(np.ma.masked_all(1), [0.9], [0.01]), "are masked"),
     (lambda: jaxgran.read_particles(None), "must be the name of a file, got None"),
     (lambda: jaxgran.read_curve("a.csv", [1]), "must be a dictionary"),
-    (lambda: jaxgran.read_gas({"eta": None}), "dictionary of texts"),
     (lambda: jaxgran.read_particles("a.gsd", dimension=4), "must be 2 or 3"),
     (lambda: cool(model=DSMC, trajectory="a.gsd"), "DSMC has no positions"),
     (lambda: cool(model=SOFT, trajectory="a.dcd"), "ends in .gsd or .xyz, got 'a.dcd'"),
@@ -323,64 +339,71 @@ CALLS = [
     (lambda: cool(tolerance=0.1), 'go with model="auto"'),
     (lambda: jax.jit(partial(cool, model="auto"))(GAS), "choose_model outside"),
     (lambda: fit(model="auto"), "must be a jaxgran model, got .auto"),
-    (lambda: jax.jit(lambda gas: fit(gas, model=SPHERES).chi2)(GAS), "one curve at a time"),
-    (lambda: likelihood(model=jaxgran.DSMC(10)), "needs a model without noise, got DSMC"),
-    (lambda: likelihood(clock=0.0), "clock must lie in"),
-    (lambda: likelihood(3), "curve must be a jaxgran.CoolingCurve"),
+    (
+        lambda: jaxgran.log_likelihood(GAS, measured(), model=jaxgran.DSMC(10)),
+        "needs a model without noise, got DSMC",
+    ),
+    (lambda: jaxgran.log_likelihood(GAS, CURVE), "measurement must be a jaxgran.Measurement"),
+    (lambda: jaxgran.log_likelihood(GAS, measured(DROPS)), "a drop test, without a curve"),
     (lambda: jaxgran.RestitutionSpline([1.0]), "two or more increasing"),
     (lambda: jaxgran.RestitutionSpline([0.1, 1.0], [0.8, 0.9]), "that decrease"),
     (lambda: jaxgran.RestitutionSpline([0.1, 1.0], [1.0, 0.9]), r"in \(0, 1\)"),
     (lambda: jaxgran.RestitutionSpline([0.1, 1.0], [0.9, 0.8, 0.7]), "must be 2 numbers"),
     (lambda: jaxgran.RestitutionSpline([0.1, 1.0], [0.9, 0.8], 0.0), "smoothness"),
 ]
+TWO = {"a": measured(DROPS), "b": measured(DROPS)}
+DISAGREE = {
+    name: measured(DROPS, priors={"youngs_modulus": (Y, 1e6)})
+    for name, Y in {"a": 5e7, "b": 6e7}.items()
+}
 FITS = [
     ({"free": "amplitude"}, "no float 'amplitude'"),
     ({"free": ()}, "free must be a tuple"),
     ({"free": (T_0, T_0)}, "different names"),
-    ({"free": "law", "gas": FIXED}, 'free="law", but the law Fixed has no floats'),
-    ({"solver": "simplex"}, "solver must be a least-squares solver or a minimiser"),
-    ({"solver": "adam"}, "gradient transformation of optax"),
-    (HAFF | {"solver": optax.lbfgs()}, "line search"),
+    (
+        {"free": "law", "measurement": measured(gas=FIXED)},
+        'free="law", but the law Fixed has no floats',
+    ),
+    ({"solver": "simplex"}, "solver must be a gradient transformation of optax"),
+    (HAFF | {"measurement": measured(gas=GRAINS), "solver": optax.lbfgs()}, "line search"),
     ({"max_steps": 0}, "max_steps must be a whole number >= 1, an int, got 0"),
-    ({"num_particles": -5}, "num_particles must be a whole number >= 1, an int, got -5"),
-    ({"absent": ("gravity",)}, "absent must be a tuple of walls, roughness, drag"),
-    ({"data": FEW, "free": (A, T_0, PHI)}, "2 points .* cannot determine 3 parameters; free fewer"),
-    ({"data": NO_VALUES}, "displacement_error without the values"),
-    # priors
-    ({"priors": [(PHI, 0.05, 0.01)]}, "priors must be a dictionary of names"),
-    ({"priors": {"phi": (0.05, 0.01)}}, "no float 'phi' in this gas; it has .*, and density"),
-    ({"priors": {PHI: 0.05}}, r"packing_fraction needs \(value, standard error\)"),
-    ({"priors": {PHI: (0.05, -0.01)}}, "error of packing_fraction must lie in"),
-    ({"priors": {PHI: (0.05, 0.0)}}, "Leave out values that are known exactly"),
-    ({"priors": {PHI: (1.5, 0.1)}}, "priors: packing_fraction must lie in"),
-    ({"priors": {A: (0.0, 1e-7)}}, "lies on the end of its range"),
+    ({"quick": 1}, "quick must be True or False"),
+    (
+        {"measurement": measured(FEW), "free": (A, T_0, PHI)},
+        "3 points .* cannot determine 3 parameters; free fewer",
+    ),
     # t0
     ({"free": (A, "t0"), "model": DSMC}, "t0 is fitted through kinetic theory only"),
-    ({"priors": {"t0": (0.0, 1.0)}, "model": DSMC}, "t0 is fitted through kinetic theory only"),
-    ({"data": {"a": CURVE, "b": CURVE}, "free": (A, "t0")}, "each has its own t0"),
+    (
+        {"measurement": measured(priors={"t0": (0.0, 1.0)}), "model": DSMC},
+        "t0 is fitted through kinetic theory only",
+    ),
+    ({"measurement": {"a": measured(), "b": measured()}, "free": (A, "t0")}, "each has its own t0"),
     # models with noise
-    ({"model": DSMC, "free": (A, T_0), "priors": {T_0: (0.01, 1e-4)}}, "leave temperature out of"),
+    (
+        {"measurement": measured(priors={T_0: (0.01, 1e-4)}), "model": DSMC, "free": (A, T_0)},
+        "leave temperature out of",
+    ),
     ({"model": jaxgran.SoftSpheres(100)}, "replicas >= 2"),
     ({"model": jaxgran.SoftSpheres(100, replicas=2, projection=None)}, "projection"),
-    ({"model": SPHERES, "solver": optx.BFGS(1e-8, 1e-8)}, "least squares"),
+    ({"model": SPHERES, "solver": optx.BFGS(1e-8, 1e-8)}, "solver must be a gradient transform"),
     ({"model": DSMC, "start": ELASTIC}, "cannot start at dissipative_constant = 0.0"),
-    ({"model": DSMC, "gas": SPLINE, "free": "law"}, "KineticTheory.. or a solver of optax"),
     (
-        {"gas": OF_TWO, "model": jaxgran.HardSpheres(2, replicas=2, start=APART)}
-        | {"free": ("coefficient", T_0)},
+        {"measurement": measured(gas=SPLINE), "model": DSMC, "free": "law"},
+        "KineticTheory.. or a solver of optax",
+    ),
+    (
+        {"measurement": measured(gas=OF_TWO), "free": ("coefficient", T_0)}
+        | {"model": jaxgran.HardSpheres(2, replicas=2, start=APART)},
         "temperature cannot be fitted from a given start",
     ),
     # several measurements
-    ({"data": {}}, "data is empty"),
-    ({"data": TWO, "priors": {"c: mass": (1.0, 0.1)}}, "no measurement 'c'; there are"),
-    ({"data": TWO, "num_particles": {"c": 10}}, "no measurement 'c'; there are a, b"),
-    ({"data": TWO, "gas": {"a": GAS}}, "the same labels"),
-    ({"data": TWO, "separate": (A,)}, "different names"),
-    ({"data": TWO, "model": jaxgran.DSMC(10)}, "a model without noise"),
-    ({"data": {"a": DROPS, "b": BARE}}, "the curve of 'b' has no errors"),
-    ({"data": {"a": DROPS, "b": 3}}, "measurement 'b' must be a jaxgran.CoolingCurve or a"),
-    ({"data": DROPS, "model": DSMC}, "drop tests are fitted by a model without noise"),
-    ({"data": DROPS, "free": (A, "t0")}, "t0 needs a cooling curve"),
+    ({"measurement": TWO, "free": A, "separate": (A,)}, "different names"),
+    ({"measurement": TWO, "model": jaxgran.DSMC(10)}, "a model without noise"),
+    ({"measurement": DISAGREE}, "give different values of it, 5e.07 .* and 6e.07"),
+    ({"measurement": {"": measured()}}, "labels of measurements are texts"),
+    ({"measurement": measured(DROPS), "model": DSMC}, "drop tests are fitted by a model without"),
+    ({"measurement": measured(DROPS), "free": (A, "t0")}, "t0 needs a cooling curve"),
 ]
 CALLS += [(partial(fit, **change), words) for change, words in FITS]
 

@@ -101,6 +101,6 @@ def test_T_rot_is_less_accurate_where_sliding_slows_spins_down():
 def test_a_fit_finds_friction_and_roughness_from_both_temperatures():
     curve = synthetic(sliding(0.2, beta=0.5), None, 25, relative_error=0.005, end=40.0)
     start, names = sliding(0.5, beta=0.2), ("friction", "tangential_restitution")
-    result = jaxgran.fit(start, curve, free=names)
+    result = jaxgran.fit(jaxgran.Measurement(start, curve), free=names)
     np.testing.assert_allclose(result.value("friction")[0], 0.2, rtol=0.01)
     np.testing.assert_allclose(result.value("tangential_restitution")[0], 0.5, atol=0.02)

@@ -27,9 +27,10 @@ def compare_lammps(options: Options) -> dict:
 
 
 def compare(name: str, options: Options, top, bottom) -> dict:
-    gas, measured, header = of_lammps(name)
-    size, points = (200, 12) if options.smoke else (int(header["N"]), None)
-    measured = jax.tree.map(lambda x: x[:points], measured)
+    measurement = of_lammps(name)
+    gas = measurement.gas
+    size, points = (200, 12) if options.smoke else (measurement.num_particles, None)
+    measured = jax.tree.map(lambda x: x[:points], measurement.curve)
     curve = cool(gas, measured.times, jaxgran.SoftSpheres(size, **SETTINGS))
     theory = cool(gas, measured.times)
     t, lammps = np.asarray(measured.times), np.asarray(measured.temperature)

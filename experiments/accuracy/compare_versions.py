@@ -4,8 +4,9 @@
 
 CHECKOUT is the folder of the other version (``git worktree add --detach FOLDER COMMIT``). Both
 versions simulate the same ten scenes with all four models, with elements, derivatives and saved
-observables, fit two curves, one by kinetic theory with its diagnosis and one by DSMC, and fit two
-curves jointly. Each version runs in a separate process. Every returned array is compared. Prints
+observables, fit two curves, one by kinetic theory and one by DSMC, and fit two curves jointly. Each
+version runs in a separate process. Every returned array is compared, of fits the estimate and the
+fitted curve. Prints
 one row for each case: the number of arrays, and "identical" if all bits agree, otherwise the
 largest difference relative to the largest value of that array. The exit code is 1 if a case is not
 identical.

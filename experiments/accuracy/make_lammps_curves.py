@@ -28,18 +28,20 @@ def make_lammps_curves(options: Options) -> dict:
     folder = DATA if options.record else options.out
     folder.mkdir(parents=True, exist_ok=True)
     for name in options.scenes:
-        gas, _, header = of_lammps(name)
+        measurement = of_lammps(name)
+        header = dict(measurement.header)
         size, replicas = int(header["N"]), int(header["replicas"])
-        times, each = simulate(gas, size, replicas, float(header["end_tau"]))
+        times, each = simulate(measurement.gas, size, replicas, float(header["end_tau"]))
         T, error = map(jnp.asarray, mean_and_error(each))
         error = error.at[0].set(0.0)  # all replicas start at T_0
         curve = jaxgran.CoolingCurve(jnp.asarray(times), T, temperature_error=error)
         jaxgran.write_curve(folder / f"lammps_cooling_{name}.csv", curve, header, overwrite=True)
     figure, (axes,) = panels(size=(5.5, 4.0))
     for k, file in enumerate(sorted(DATA.glob("lammps_cooling_*.csv"))):
-        gas, curve, header = of_lammps(file.stem.removeprefix("lammps_cooling_"))
+        measurement = of_lammps(file.stem.removeprefix("lammps_cooling_"))
+        gas, curve = measurement.gas, measurement.curve
         tau, theory = curve.times[1:] / gas.mean_free_time, cool(gas, curve.times)
-        words = f"φ = {float(gas.packing_fraction):g}, N = {header['N']}"
+        words = f"φ = {float(gas.packing_fraction):g}, N = {measurement.num_particles}"
         axes.plot(tau, theory.temperature[1:] / gas.temperature, color=THEORY, lw=1)
         look = {"color": INK, "mfc": "white", "ms": 4, "label": words}
         axes.plot(tau, curve.temperature[1:] / gas.temperature, "osD^vP"[k], **look)

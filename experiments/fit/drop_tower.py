@@ -70,10 +70,11 @@ def fitted(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve) -> tuple[jaxgran.Fit, 
     """Fit a run as smooth spheres without walls, and with the complete scene."""
     unknown = gas.replace(dissipative_constant=0.0, tangential_restitution=0.0)
     smooth = dataclasses.replace(unknown, surface=None, container=None)
-    free = ("dissipative_constant", "temperature")
-    first = fit_quietly(smooth, temperature_only(curve), free=free, num_particles=NUM_PARTICLES)
+    of_T = jaxgran.Measurement(smooth, temperature_only(curve), num_particles=NUM_PARTICLES)
+    of_both = jaxgran.Measurement(unknown, curve, num_particles=NUM_PARTICLES)
+    first = fit_quietly(of_T, free=("dissipative_constant", "temperature"), quick=True)
     free = ("dissipative_constant", "tangential_restitution", "rotational_temperature")
-    return first, fit_quietly(unknown, curve, free=free, num_particles=NUM_PARTICLES)
+    return first, fit_quietly(of_both, free=free, quick=True)
 
 
 def drop_tower(options: Options) -> dict:
@@ -83,7 +84,7 @@ def drop_tower(options: Options) -> dict:
     smooth, complete = zip(*(fitted(gas, curve) for curve in curves), strict=True)
     right = [float(fit.estimate[0]) / A for fit in complete]
     errors = [float(fit.standard_error[0]) / A for fit in complete]
-    found = [float(fit.estimate[0]) / A for fit in smooth if not fit.undetermined()]
+    found = [float(fit.estimate[0]) / A for fit in smooth if not fit.undetermined]
     return {
         "A_over_true": right,
         "error_over_true": errors,
@@ -97,7 +98,7 @@ def drop_tower(options: Options) -> dict:
 
 def in_words(result: jaxgran.Fit, A: float) -> str:
     """Format A and its error over the true A."""
-    if "dissipative_constant" in result.undetermined():
+    if "dissipative_constant" in result.undetermined:
         return "not determined"
     return f"{result.estimate[0] / A:.2f} ± {result.standard_error[0] / A:.2f}"
 

@@ -58,11 +58,18 @@ KEY = 1  # of the random numbers of the searches
 
 @dataclasses.dataclass
 class Problem:
-    """A curve to be fitted: the gas with the true values, the curve, and the simulator."""
+    """A curve to be fitted, with the true values of its gas, and the simulator."""
 
-    gas: jaxgran.Gas
-    curve: jaxgran.CoolingCurve
+    measurement: jaxgran.Measurement
     model: jaxgran.AbstractModel
+
+    @property
+    def gas(self) -> jaxgran.Gas:
+        return self.measurement.gas
+
+    @property
+    def curve(self) -> jaxgran.CoolingCurve:
+        return self.measurement.curve
 
     def at(self, point: np.ndarray) -> jaxgran.Gas:
         """Return the gas at a point: logarithms of the ratios of parameters to the true ones."""
@@ -74,27 +81,30 @@ class Problem:
         return cool(self.at(point), self.curve.times, self.model, KEY)
 
 
-def dense() -> tuple[jaxgran.Gas, jaxgran.CoolingCurve]:
-    gas, curve, _ = of_lammps("dense")
-    keep = np.asarray(curve.times) < END * float(gas.mean_free_time)
-    return gas, jax.tree.map(lambda x: x[keep], curve)
+def dense() -> jaxgran.Measurement:
+    measurement = of_lammps("dense")
+    keep = np.asarray(measurement.curve.times) < END * float(measurement.gas.mean_free_time)
+    early = jax.tree.map(lambda x: x[keep], measurement.curve)
+    return dataclasses.replace(measurement, data=early)
 
 
 def stochastic(options: Options) -> Problem:
-    gas, curve = dense()
+    lammps = dense()
     size = 1000 if options.smoke else 20_000
-    made = cool(gas, curve.times, jaxgran.DSMC(size, replicas=8), KEY + 1)
+    made = cool(lammps.gas, lammps.curve.times, jaxgran.DSMC(size, replicas=8), KEY + 1)
     # All replicas start from the same temperature.
     later = jax.tree.map(lambda x: x[1:], temperature_only(made))
-    return Problem(gas, later, jaxgran.DSMC(size, replicas=2))
+    measurement = jaxgran.Measurement(lammps.gas, later, num_particles=size, replicas=8)
+    return Problem(measurement, jaxgran.DSMC(size, replicas=2))
 
 
 def soft_spheres(options: Options) -> Problem:
-    gas, curve = dense()
+    lammps = dense()
+    gas = lammps.gas
     hottest = gas.replace(temperature=gas.temperature * np.exp(OFF[1] + REACH[1]))
     model = jaxgran.SoftSpheres(1000, replicas=4, steps_per_contact=20)
     # One capacity for all parameters: nothing compiles again.
-    return Problem(gas, curve, model.sized_for(hottest))
+    return Problem(lammps, model.sized_for(hottest))
 
 
 def search_law(count: int, number: int, size: int, *most: int) -> dict:
@@ -106,7 +116,7 @@ def search_law(count: int, number: int, size: int, *most: int) -> dict:
     made = cool(gas, times, jaxgran.HardSpheres(size, replicas=8), KEY + 1)
     error = np.sqrt(8.0) * made.temperature_error  # of one run, which is the measured curve
     T = made.replicas.temperature[number]
-    curve = jaxgran.CoolingCurve(times, T, temperature_error=error)
+    curve = jaxgran.CoolingCurve(times, T)
     log_mean = np.log(np.asarray(made.temperature))
     slope = np.gradient(log_mean, times, edge_order=2)
     steps = np.diff(times, prepend=0.0) * np.exp(-log_mean / 2)  # of the variance of a clock
@@ -144,7 +154,8 @@ def search_law(count: int, number: int, size: int, *most: int) -> dict:
     first = best + np.log(2.0)
     options = {"max_steps": most[0], "solver": optax.adam(0.1), "progress": False}
     options |= {"model": model, "free": (name,), "start": at(first), "key": jax.random.key(KEY)}
-    course = np.log(jaxgran.fit(true, curve, **options).minima.trace.parameters)
+    measurement = jaxgran.Measurement(true, curve, num_particles=size)
+    course = np.log(jaxgran.fit(measurement, **options).trace.parameters)
     chi2, of_simplex = recorded(lambda flat: float(np.sum(residuals(flat) ** 2)))
     nelder_mead(chi2, first, None, most[1], -0.3 * np.ones(count))
     guesses = {
@@ -233,7 +244,8 @@ def compare(scene: str, problem: Problem, count: int, smoke: bool) -> Iterator[d
 
     searches = {"bounded scalar": bounded} if count == 1 else {}
     searches |= {"Nelder-Mead": nelder_mead, "differential evolution": differential_evolution}
-    found = {"jaxgran.fit": with_derivatives(problem, count, most)}
+    course, standard_error = with_derivatives(problem, count, most)
+    found = {"jaxgran.fit": course}
     for name, search in searches.items():
         chi2, found[name] = recorded(misfit)
         search(chi2, first, list(zip(first - reach, first + reach, strict=True)), most)
@@ -241,21 +253,26 @@ def compare(scene: str, problem: Problem, count: int, smoke: bool) -> Iterator[d
         row = {"scene": scene, "search": name, "free": PARAMETERS[:count]}
         row["simulations"] = needed(np.abs(guesses).max(axis=1) < WITHIN)
         row |= {"all_simulations": len(guesses), "last_error": np.exp(guesses[-1]) - 1}
+        if name == "jaxgran.fit":
+            row["standard_error"] = standard_error
         yield row | {"guesses": np.exp(guesses)}
 
 
-def with_derivatives(problem: Problem, count: int, most: int) -> list[np.ndarray]:
-    """Return the guess of `jaxgran.fit` after each simulation."""
-    names, guesses = PARAMETERS[:count], []
+def with_derivatives(problem: Problem, count: int, most: int) -> tuple[list, np.ndarray]:
+    """Return the guess of `jaxgran.fit` after each simulation, and its last relative error."""
+    names = PARAMETERS[:count]
+    guesses = []
+    standard_error = np.full(count, np.nan)
     true = np.asarray([float(problem.gas.value(name)) for name in names])
     options = {"model": problem.model, "free": names, "start": problem.at(OFF[:count])}
-    options |= {"key": jax.random.key(KEY), "progress": False}
+    options |= {"key": jax.random.key(KEY), "progress": False, "quick": True}
     for simulations in range(1, most + 1):
-        fitted = jaxgran.fit(problem.gas, problem.curve, max_steps=simulations, **options)
+        fitted = jaxgran.fit(problem.measurement, max_steps=simulations, **options)
         if fitted.iterations < simulations:
             break
         guesses.append(np.log(np.asarray(fitted.estimate) / true))
-    return guesses
+        standard_error = np.asarray(fitted.standard_error) / true
+    return guesses, standard_error
 
 
 def bounded(chi2, first, bounds, most) -> None:

@@ -53,10 +53,11 @@ def with_spline(gas: jaxgran.Gas, low: float, high: float) -> jaxgran.Gas:
     return dataclasses.replace(gas, law=law)
 
 
-def learn(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve, num_particles: int) -> jaxgran.Fit:
+def learn(measurement: jaxgran.Measurement) -> jaxgran.Fit:
     """The whole recipe: knots over the visited speeds, and a fit of all numbers of the law."""
-    learner = with_spline(gas, *jaxgran.RestitutionSpline.visited_speeds(curve.temperature))
-    return jaxgran.fit(learner, curve, free="law", num_particles=num_particles)
+    speeds = jaxgran.RestitutionSpline.visited_speeds(measurement.curve.temperature)
+    learner = with_spline(measurement.gas, *speeds)
+    return jaxgran.fit(dataclasses.replace(measurement, gas=learner), free="law", quick=True)
 
 
 def curves_of(gas, model, taus, seed):
@@ -112,29 +113,34 @@ def learn_law(options: Options) -> dict:
         gas = jaxgran.Gas(law, **BEADS, temperature=T)
         for seed, model in enumerate(models[:few]):
             curves = list(curves_of(gas, model, taus, seed))
-            fits = [learn(gas, curve, size) for curve in curves]
+            known = [jaxgran.Measurement(gas, curve, num_particles=size) for curve in curves]
+            fits = [learn(measurement) for measurement in known]
             worlds[f"{truth}, {model.name}"] = [judge(gas, fit) for fit in fits]
             shown.setdefault(truth, (gas, fits[0]))
         if truth == "viscoelastic":
             beads = [row for rows in worlds.values() for row in rows]
-            worlds["viscoelastic, with drop tests"] = [with_drops(gas, curves[-1], size)]
+            worlds["viscoelastic, with drop tests"] = [with_drops(known[-1])]
     for name in LAMMPS_CURVES[:few]:
-        gas, curve, header = of_lammps(name)
-        after = jax.tree.map(lambda x: x[1:], temperature_only(curve))  # the start
-        worlds[f"LAMMPS, {name}"] = [judge(gas, learn(gas, after, int(header["N"])))]
+        measurement = of_lammps(name)
+        # Without the start.
+        after = jax.tree.map(lambda x: x[1:], temperature_only(measurement.curve))
+        learnt = learn(dataclasses.replace(measurement, data=after))
+        worlds[f"LAMMPS, {name}"] = [judge(measurement.gas, learnt)]
     found = {name: summary(rows) for name, rows in worlds.items()}
     return {"worlds": found, "beads": summary(beads), "picture": draw(shown)}
 
 
-def with_drops(gas: jaxgran.Gas, curve: jaxgran.CoolingCurve, size: int) -> dict:
+def with_drops(measurement: jaxgran.Measurement) -> dict:
     """Learn from a curve and from 20 drops of single beads at a twentieth of its lowest speed."""
-    low, high = jaxgran.RestitutionSpline.visited_speeds(curve.temperature)
+    gas = measurement.gas
+    low, high = jaxgran.RestitutionSpline.visited_speeds(measurement.curve.temperature)
     speeds = np.geomspace(low / 20, 3 * low / 20, 20)
     noise = 0.002 * np.random.default_rng(0).normal(size=speeds.size)
     drops = jaxgran.DropTest(speeds, gas.restitution(speeds) + noise, np.full(20, 0.002))
-    data = {"gas": curve, "drops": drops}
-    learners = dict.fromkeys(data, with_spline(gas, speeds[0], high))
-    result = jaxgran.fit(learners, data, free="law", num_particles={"gas": size})
+    learner = with_spline(gas, speeds[0], high)
+    curve = dataclasses.replace(measurement, gas=learner)
+    both = {"gas": curve, "drops": jaxgran.Measurement(learner, drops)}
+    result = jaxgran.fit(both, free="law", quick=True)
     return judge(gas, result, speeds[[0, -1]])
 
 

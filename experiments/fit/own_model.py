@@ -58,14 +58,15 @@ def own_model(_) -> dict:
     noise = 0.01 * jax.random.normal(jax.random.key(0), times.shape)
     curve = jaxgran.CoolingCurve(times, exact * jnp.exp(noise), temperature_error=0.01 * exact)
     free = ("coefficient", "temperature")
-    result = jaxgran.fit(gas.replace(coefficient=0.5), curve, model=HaffLaw(), free=free)
+    measurement = jaxgran.Measurement(gas.replace(coefficient=0.5), curve)
+    result = jaxgran.fit(measurement, model=HaffLaw(), free=free)
     print(result)
     return {
         "T_over_theory": own / theory,
         "choice": choice.reasons[0],
         "fitted": {name: result.value(name) for name in free},
-        "verdict": jaxgran.diagnose(result, curve).verdict,
-        "picture": jaxgran.plot_fit(result, curve)[0].figure,
+        "verdict": result.verdict,
+        "picture": jaxgran.plot_fit(result)[0].figure,
     }
 
 

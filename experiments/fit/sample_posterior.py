@@ -1,14 +1,14 @@
-"""Does the error bar of a fit agree with the posterior? NUTS on (A, phi, T_0, clock).
+"""Does the error bar of a fit agree with the posterior? NUTS on (A, phi, T_0).
 
     python experiments/fit/sample_posterior.py [--samples 1000] [--chains 4] [--warmup 600]
         [--out DIR]
 
 The curve is the dilute LAMMPS curve, with phi known within 4 % and T_0 within 1 %. The sampler uses
-`jaxgran.log_likelihood` and the priors of the fit: of phi, of T_0, and of the mean and the trend of
-the error of kinetic theory's clock. Finds both results and the effective samples per second, and
-draws a corner plot.
+`jaxgran.log_likelihood`, which the fit maximises, and the priors of the fit, of phi and of T_0.
+Finds both results and the effective samples per second, and draws a corner plot.
 """
 
+import dataclasses
 import time
 from typing import Any
 
@@ -22,8 +22,8 @@ from corner import corner
 
 import jaxgran
 from experiments.support.plots import THEORY
-from experiments.support.record import DATA, Options, run_parts
-from experiments.support.scenes import temperature_only
+from experiments.support.record import Options, run_parts
+from experiments.support.scenes import of_lammps, temperature_only
 
 FREE = ("dissipative_constant", "temperature")
 PRIORS = {"packing_fraction": 0.04, "temperature": 0.01}
@@ -37,13 +37,14 @@ LABELS = ("A (1e-6 s)", "phi", "T_0 (1e-2 m²/s²)")
 
 
 def sample_posterior(options: Options) -> dict:
-    curve, header = jaxgran.read_curve(DATA / "lammps_cooling_dilute.csv")
-    # T only: the factor of <dr^2> in the fit is a parameter that the likelihood integrates out.
-    gas, curve = jaxgran.read_gas(header), temperature_only(curve)
-    values = {name: float(gas.value(name)) for name in PRIORS}
+    lammps = of_lammps("dilute")
+    values = {name: float(lammps.gas.value(name)) for name in PRIORS}
     priors = {name: (x, PRIORS[name] * x) for name, x in values.items()}
-    result = jaxgran.fit(gas, curve, free=FREE, priors=priors)
-    samples, facts = sample(*log_posterior(gas, curve, priors, result), options)
+    # T only: the factor of <dr^2> in the fit is a parameter that the likelihood integrates out.
+    of_T = temperature_only(lammps.curve)
+    measurement = dataclasses.replace(lammps, data=of_T, priors=priors)
+    result = jaxgran.fit(measurement, free=FREE, quick=True)
+    samples, facts = sample(*log_posterior(measurement, priors, result), options)
     A, phi, T_0 = samples.reshape(-1, 3).T
     for name, values in zip(FREE, (A, T_0), strict=True):
         estimate, error = (float(x) for x in result.value(name))
@@ -52,30 +53,27 @@ def sample_posterior(options: Options) -> dict:
     return facts | {"picture": draw(result, np.stack([A * 1e6, phi, T_0 * 100], axis=1))}
 
 
-def log_posterior(gas, curve, priors, result):
+def log_posterior(measurement, priors, result):
     """Return the posterior of theta, and the SI values (A, phi, T_0) of theta.
 
-    theta is (ln A, ln phi, ln T_0, mean and trend of ln clock), each less its prior or fitted value
-    and over its prior or fitted error, so that its entries are of order one.
+    theta is (ln A, ln phi, ln T_0), each less its prior or fitted value and over its prior or
+    fitted error, so that its entries are of order one.
     """
     phi, e_phi = priors["packing_fraction"]
     T_0, e_T = priors["temperature"]
     A, e_A = (float(x) for x in result.value("dissipative_constant"))
     centre = jnp.log(jnp.array([A, phi, T_0]))
     width = jnp.array([e_A / A, e_phi / phi, e_T / T_0])
-    accuracy = result.model.derivative_accuracy
-    log_T = jnp.log(curve.temperature)
-    along = 2 * (log_T - log_T[0]) / (log_T[-1] - log_T[0]) - 1
 
     def values(theta):
-        return jnp.exp(centre + width * theta[:3])
+        return jnp.exp(centre + width * theta)
 
     def log_density(theta):
         A, phi, T_0 = values(theta)
-        now = gas.replace(dissipative_constant=A, packing_fraction=phi, temperature=T_0)
-        clock = jnp.exp(accuracy * (theta[3] + theta[4] * along))
+        changed = {"dissipative_constant": A, "packing_fraction": phi, "temperature": T_0}
+        now = measurement.gas.replace(**changed)
         # The prior of A is flat in ln A.
-        likelihood = jaxgran.log_likelihood(now, curve, model=MODEL, clock=clock)
+        likelihood = jaxgran.log_likelihood(now, measurement, model=MODEL)
         return likelihood - 0.5 * jnp.sum(theta[1:] ** 2)
 
     return log_density, values
@@ -86,7 +84,7 @@ def sample(log_density, values, options) -> tuple[np.ndarray, dict]:
     warm_key, key = jax.random.split(jax.random.key(0))
     full = {"is_mass_matrix_diagonal": False}
     adapt: Any = blackjax.window_adaptation(blackjax.nuts, log_density, **full)
-    (state, tuned), _ = adapt.run(warm_key, jnp.zeros(5), options.warmup)
+    (state, tuned), _ = adapt.run(warm_key, jnp.zeros(3), options.warmup)
     nuts: Any = blackjax.nuts(log_density, **tuned)
 
     def chain(key):

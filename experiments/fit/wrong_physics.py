@@ -10,7 +10,7 @@ with T_rot measured. Finds for each row
 - A: fitted over true A, median;
 - scatter: the standard deviation of ln A over the runs; off: the root mean square of ln(A/true A),
   which contains what all runs have in common, too; expected: these by the error bar;
-- held: runs whose error bar "if nothing else is there" (95 %) contains the true A;
+- held: runs whose error bar "assuming no other effect" (95 %) contains the true A;
 - inside: runs whose range over all explanations contains it;
 - grades: how many runs are determined, not determined, not consistent.
 
@@ -192,11 +192,11 @@ def statistics(number: int, runs: int) -> dict:
     for run, T in enumerate(np.asarray(each) + row.floor * float(gas.temperature)):
         T_rot = rotation[run] if row.free else None
         one = jaxgran.CoolingCurve(times, T, rotational_temperature=T_rot)
-        result = fit_quietly(gas, one, model=THEORY, free=free, num_particles=NUM_PARTICLES)
-        diagnosis = jaxgran.diagnose(result)
-        ends = diagnosis.ranges.get("dissipative_constant", (np.nan, np.nan))
+        measurement = jaxgran.Measurement(gas, one, num_particles=NUM_PARTICLES)
+        result = fit_quietly(measurement, model=THEORY, free=free)
+        ends = result.ranges.get("dissipative_constant", (np.nan, np.nan))
         numbers = *result.value("dissipative_constant"), *ends
-        found.append((*(float(np.squeeze(x)) / TRUE_A for x in numbers), diagnosis.grade))
+        found.append((*(float(np.squeeze(x)) / TRUE_A for x in numbers), result.grade))
     *numbers, grades = zip(*found, strict=True)
     A, error, low, high = np.array(numbers)
     known = np.isfinite(low)

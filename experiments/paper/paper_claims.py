@@ -131,14 +131,15 @@ def laws() -> dict:
     theta = np.asarray(late.temperature / gas.temperature)
     leading = 54 / (RATE * 0.093) * (theta**-0.1 - 1) * gas.temperature * gas.mean_free_time**2
     power = np.log(theta[2] / theta[1]) / np.log(late.collisions[2] / late.collisions[1])
-    gas, measured, _ = of_lammps("dilute")
-    theory = jaxgran.cool(gas, measured.times)
+    lammps = of_lammps("dilute")
+    measured = lammps.curve
+    theory = jaxgran.cool(lammps.gas, measured.times)
     return {
         "first_temperature": float(closed_forms.paper_temperature(0.0, 0.093, corrected=False)),
         "temperature_off": miss(formula, curve.temperature),
         "leading": (leading / np.asarray(late.displacement)).tolist(),
         "power_of_N": float(power),
-        "lammps_delta": float(gas.delta),
+        "lammps_delta": float(lammps.gas.delta),
         "lammps_T": miss(theory.temperature[1:], measured.temperature[1:]),
         "lammps_displacement": miss(theory.displacement[1:], measured.displacement[1:]),
     }

@@ -20,8 +20,8 @@ ratio of seconds, now over before, and its standard error. The tasks, of which e
 import, are (`support/version.py`)
 
     reference: the first call of `jax.jit(jax.jacfwd(...))` of ln T of kinetic theory in A and T_0.
-    fit: fit and diagnosis of a curve with 61 points, then of one with 47, then with other `free`.
-    lengths: fit and diagnosis of 20 curves of 20 lengths.
+    fit: fit with its range of a curve with 61 points, then of one with 47, then with other `free`.
+    lengths: fits with their ranges of 20 curves of 20 lengths.
     command: `jaxgran fit` as a process, with an empty cache, again, and without a cache.
     SoftSpheres, HardSpheres, DSMC: runs of one mean free time; the last one of the first two
         continues from the particles of the one before.

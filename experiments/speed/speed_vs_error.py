@@ -71,11 +71,12 @@ def speed_vs_error(options: Options) -> dict:
 
 def measured(name: str, smoke: bool) -> Scene:
     """Return a gas whose curve was simulated in LAMMPS."""
-    gas, curve, header = of_lammps(name)
+    lammps = of_lammps(name)
     last = 6 if smoke else None
-    curve = jax.tree.map(lambda x: np.asarray(x)[1:last], curve)  # at t = 0 nothing is measured
-    label = f"LAMMPS, N = {header['N']}, {header['replicas']} replicas"
-    return Scene(gas, curve.times, curve.temperature, curve.temperature_error, label)
+    # At t = 0 nothing is measured.
+    curve = jax.tree.map(lambda x: np.asarray(x)[1:last], lammps.curve)
+    label = f"LAMMPS, N = {lammps.num_particles}, {lammps.replicas} replicas"
+    return Scene(lammps.gas, curve.times, curve.temperature, curve.temperature_error, label)
 
 
 def clustering() -> Scene:

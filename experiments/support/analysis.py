@@ -78,11 +78,11 @@ def crossing(x: np.ndarray, y: np.ndarray, level: float) -> float:
     return float(x[i - 1] + (level - y[i - 1]) / (y[i] - y[i - 1]) * (x[i] - x[i - 1]))
 
 
-def fit_quietly(*measured: Any, **options: Any) -> jaxgran.Fit:
+def fit_quietly(measurement: jaxgran.Measurement, **options: Any) -> jaxgran.Fit:
     """Return a fit without the warning that a parameter is not determined, which is recorded."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        return jaxgran.fit(*measured, **options)
+        return jaxgran.fit(measurement, **options)
 
 
 def gases_of(beta: float) -> dict[str, tuple[jaxgran.Gas, str, str]]:

@@ -10,7 +10,6 @@ from scipy.optimize import root_scalar
 
 import jaxgran
 from experiments.support.record import DATA
-from jaxgran.data.files import header_number
 
 
 def beads(
@@ -84,11 +83,9 @@ def restitution_like(gas: jaxgran.Gas) -> float:
     return float((1 - gas.dimension * rate) ** 0.5)
 
 
-def of_lammps(name: str) -> tuple[jaxgran.Gas, jaxgran.CoolingCurve, dict[str, str]]:
-    """Return a gas with its true A, its curve simulated in LAMMPS, and the header of the file."""
-    curve, header = jaxgran.read_curve(DATA / f"lammps_cooling_{name}.csv")
-    gas = jaxgran.read_gas(header)
-    return gas.replace(dissipative_constant=header_number(header, "A")), curve, header
+def of_lammps(name: str) -> jaxgran.Measurement:
+    """Return a curve simulated in LAMMPS, with its gas, which has the true A."""
+    return jaxgran.read_measurement(DATA / f"lammps_cooling_{name}.csv")
 
 
 def temperature_only(curve: jaxgran.CoolingCurve) -> jaxgran.CoolingCurve:

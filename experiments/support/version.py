@@ -48,9 +48,33 @@ def step(name: str, call: Any, repeats: int = 1) -> Any:
     return result
 
 
-def fitted_by_theory(gas: Any, curve: Any) -> Any:
-    result = jaxgran.fit(gas, curve, free=BOTH)
-    return result, jaxgran.diagnose(result, curve)
+ANY_VERSION: Any = jaxgran
+IS_OLD = not hasattr(jaxgran, "Measurement")
+"""Whether fits take a gas and a curve, and their ranges are a second call, as in version 0.2."""
+
+
+def fit_of(gas: Any, curve: Any, **options: Any) -> Any:
+    """Return a fit of a curve, or of several by label, without its range."""
+    if IS_OLD:
+        return ANY_VERSION.fit(gas, curve, **options)
+    if isinstance(curve, dict):
+        measurement: Any = {label: jaxgran.Measurement(gas[label], x) for label, x in curve.items()}
+    else:
+        measurement = jaxgran.Measurement(gas, curve)
+    return jaxgran.fit(measurement, quick=True, **options)
+
+
+def fit_with_range(gas: Any, curve: Any) -> Any:
+    if IS_OLD:
+        result = fit_of(gas, curve, free=BOTH)
+        return result, ANY_VERSION.diagnose(result, curve)
+    return jaxgran.fit(jaxgran.Measurement(gas, curve), free=BOTH)
+
+
+def estimate_and_curve(result: Any) -> Any:
+    """Return what is compared of fits: the estimate, and T of the fitted curve or curves."""
+    curves = result.curve if isinstance(result.curve, dict) else {"": result.curve}
+    return result.estimate, {label: curve.temperature for label, curve in curves.items()}
 
 
 def of_points(curve: Any, count: int) -> Any:
@@ -77,18 +101,18 @@ def reference(gas: Any, curve: Any, _: int) -> None:
 
 
 def lengths(gas: Any, curve: Any, _: int) -> None:
-    """Fit and diagnose curves of 20 lengths."""
+    """Fit curves of 20 lengths, with their ranges."""
     curves = [of_points(curve, count) for count in range(40, 60)]
-    step("20 lengths, fit and diagnose", lambda: [fitted_by_theory(gas, x) for x in curves])
+    step("20 lengths, fits with ranges", lambda: [fit_with_range(gas, x) for x in curves])
 
 
 def fit(gas: Any, curve: Any, _: int) -> None:
-    """Fit and diagnose a curve of 61 points, one of 47, and with another free parameter."""
+    """Fit a curve of 61 points and one of 47 with their ranges, and another free parameter."""
     for points, words in ((61, "first"), (47, "47 points,")):
         some = of_points(curve, points)
-        step(f"{words} fit and diagnose", partial(fitted_by_theory, gas, some))
-    step("fit again", lambda: jaxgran.fit(gas, some, free=BOTH), repeats=5)
-    step("other free", lambda: jaxgran.fit(gas, some, free=BOTH[:1]))
+        step(f"{words} fit with its range", partial(fit_with_range, gas, some))
+    step("fit again", lambda: fit_of(gas, some, free=BOTH), repeats=5)
+    step("other free", lambda: fit_of(gas, some, free=BOTH[:1]))
 
 
 def first_run(name: str, gas: Any, _: Any, num: int) -> None:
@@ -158,15 +182,13 @@ def fitted(model: Any) -> Any:
     gas = beads()
     curve = cool(gas, 20.0, jaxgran.DSMC(2000, replicas=2))
     start = gas.replace(dissipative_constant=1.2 * gas.value(A))
-    return jaxgran.fit(start, curve, model=model, key=jax.random.key(1), progress=False)
+    return fit_of(start, curve, model=model, key=jax.random.key(1), progress=False)
 
 
 def fitted_jointly(model: Any) -> Any:
     gases = {str(phi): beads(phi=phi) for phi in (0.02, 0.1)}
     curves = {name: cool(gas, 20.0, model) for name, gas in gases.items()}
-    if hasattr(jaxgran, "fit_jointly"):  # of versions before 0.2.0
-        return jaxgran.fit_jointly({name: (gases[name], curves[name]) for name in gases})
-    return jaxgran.fit(gases, curves)
+    return fit_of(gases, curves)
 
 
 def cases(gas: Any, curve: Any) -> dict[str, Callable]:
@@ -193,9 +215,9 @@ def cases(gas: Any, curve: Any) -> dict[str, Callable]:
         "hard disks, constant restitution, driven": lambda: cool(disks, 5, Hard(200), "particles"),
         "soft spheres": lambda: (cool(dense, 3, Soft(100)), slope(dense, 2, Soft(100))),
         "soft spheres, friction, walls, drag": lambda: cool(grains, 2, Soft(200)),
-        "fit by kinetic theory, diagnosis": lambda: fitted_by_theory(gas, curve),
-        "fit by DSMC": lambda: fitted(DSMC(1000, 2)),
-        "joint fit": lambda: fitted_jointly(DSMC(1000, 2)),
+        "fit by kinetic theory": lambda: estimate_and_curve(fit_of(gas, curve, free=BOTH)),
+        "fit by DSMC": lambda: estimate_and_curve(fitted(DSMC(1000, 2))),
+        "joint fit": lambda: estimate_and_curve(fitted_jointly(DSMC(1000, 2))),
     }
 
 
@@ -216,11 +238,12 @@ if __name__ == "__main__":
     jax.monitoring.register_event_duration_secs_listener(hear)
     task, file, number = sys.argv[1:]
     measured, header = jaxgran.read_curve(file)
-    measured_gas = jaxgran.read_gas(header)
+    read_gas = ANY_VERSION.read_gas if IS_OLD else (lambda _: jaxgran.read_measurement(file).gas)
+    measured_gas = read_gas(header)
     tasks: dict[str, Any] = {"reference": reference, "fit": fit, "lengths": lengths}
     tasks |= {"speed": speed, "numbers": numbers}
     tasks |= {name: partial(first_run, name) for name in SPEED}
-    if task != "numbers":
-        measured_gas = measured_gas.replace(dissipative_constant=3e-6)
+    constant = 0.0 if task == "numbers" else 3e-6
+    measured_gas = measured_gas.replace(dissipative_constant=constant)
     tasks[task](measured_gas, measured, int(number))
     print(json.dumps({"package": jaxgran.__file__, "steps": STEPS}))

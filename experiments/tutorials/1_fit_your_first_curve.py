@@ -15,29 +15,28 @@ import jaxgran
 from experiments.support.record import DATA
 
 jax.config.update("jax_enable_x64", True)
-curve, header = jaxgran.read_curve(DATA / "lammps_cooling_dilute.csv")
-gas = jaxgran.read_gas(header)
-print(gas)
+measurement = jaxgran.read_measurement(DATA / "lammps_cooling_dilute.csv")
+print(measurement)
 
 # %% [markdown]
 # A curve file is a header with the gas (packing fraction, diameter, density, Young's modulus,
-# Poisson's ratio, all in SI units) and columns `t,T,T_err`. The value of $A$ in this header is the
-# one used in LAMMPS; `read_gas` leaves it out, and no fit reads it.
+# Poisson's ratio, all in SI units), the number of spheres and of runs, and columns `t,T,T_err`. The
+# value of $A$ in this header is the one used in LAMMPS; a fit of $A$ does not use it.
 #
 # We leave $A$ and the initial temperature $T_0$ free. The model is kinetic theory, a set of
 # ordinary differential equations for $T$ and for the shape of the velocity distribution, and JAX
 # gives the fit its exact derivatives.
 
 # %%
-result = jaxgran.fit(gas, curve, free=("dissipative_constant", "temperature"))
+result = jaxgran.fit(measurement, free=("A", "T0"))
 A, error = (float(x) for x in result.value("dissipative_constant"))
-print(f"A = {A:.4g} +- {error:.1g} s; used in LAMMPS: {float(header['A']):.4g} s")
-jaxgran.plot_fit(result, curve)
+used = float(measurement.gas.dissipative_constant)
+print(f"A = {A:.4g} +- {error:.1g} s; used in LAMMPS: {used:.4g} s")
+jaxgran.plot_fit(result)
 
 # %% [markdown]
-# The points of the lower panel are residuals in units of the error of a point. The error of $A$ has
-# several causes. Here the largest is the accuracy of kinetic theory itself; more measured points
-# would not reduce it.
+# The points of the lower panel are residuals in units of their standard deviation, each without
+# what is expected from the points before it. The error of $A$ has several causes.
 
 # %%
 for cause, part in result.error_budget.items():
@@ -45,13 +44,12 @@ for cause, part in result.error_budget.items():
 
 # %% [markdown]
 # A good fit does not prove the model: another law of loss might explain the same curve with another
-# $A$. `diagnose` fits such alternatives, too (drag, rough grains, walls, a noise floor, a late
+# $A$. So `fit` compares such alternatives, too (drag, rough grains, walls, a noise floor, a late
 # clock) and gives the range of $A$ over all that the curve does not exclude.
 
 # %%
-diagnosis = jaxgran.diagnose(result, curve, num_particles=4000)
-print(diagnosis.verdict)
-low, high = (float(x[0]) for x in diagnosis.ranges["dissipative_constant"])
+print(result.verdict)
+low, high = (float(x[0]) for x in result.ranges["dissipative_constant"])
 print(f"range of A over all alternatives: {low:.3g} to {high:.3g} s")
 
 # %% [markdown]
@@ -62,10 +60,11 @@ print(f"range of A over all alternatives: {low:.3g} to {high:.3g} s")
 # %%
 v = np.geomspace(1e-4, 1.0, 100)
 fig, axes = plt.subplots(figsize=(6, 4), layout="constrained")
-laws = {a: gas.replace(dissipative_constant=a).restitution(v) for a in (A, low, high)}
+laws = {a: result.gas.replace(dissipative_constant=a).restitution(v) for a in (A, low, high)}
 axes.fill_between(v, laws[low], laws[high], color="0.85", label="range over all alternatives")
 axes.semilogx(v, laws[A], color="#0072b2", label=f"A = {1e6 * A:.2f} µs")
-for T in (curve.temperature[0], curve.temperature[-1]):
+first, last = measurement.curve.temperature[0], measurement.curve.temperature[-1]
+for T in (first, last):
     axes.axvline((2 * float(T)) ** 0.5, color="0.5", ls=":")
 axes.set(xlabel="impact speed v (m/s)", ylabel=r"coefficient of restitution $\epsilon$")
 axes.legend(frameon=False)

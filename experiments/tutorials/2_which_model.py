@@ -24,8 +24,8 @@ from experiments.support.record import DATA
 from jaxgran.plotting import COLOURS
 
 jax.config.update("jax_enable_x64", True)
-curve, header = jaxgran.read_curve(DATA / "lammps_cooling_dense.csv")
-gas = jaxgran.read_gas(header).replace(dissipative_constant=float(header["A"]))
+measurement = jaxgran.read_measurement(DATA / "lammps_cooling_dense.csv")
+gas, curve = measurement.gas, measurement.curve
 times, measured = curve.times[1:40:3], curve.temperature[1:40:3]
 print(f"packing fraction {gas.packing_fraction:.2f}, mean free time {gas.mean_free_time:.2g} s")
 print(f"a contact lasts {gas.contact_fraction:.2g} mean free times")

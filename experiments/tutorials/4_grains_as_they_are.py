@@ -54,9 +54,9 @@ curve = dataclasses.replace(only_T, **rotation)
 # restitution $\beta_t$ free in addition, which $T_\mathrm{rot}$ determines.
 
 # %%
-wrong = jaxgran.fit(smooth, only_T, free=("dissipative_constant", "temperature"))
+wrong = jaxgran.fit(jaxgran.Measurement(smooth, only_T, num_particles=3000), free=("A", "T0"))
 guess = rough.replace(tangential_restitution=-0.3)
-right = jaxgran.fit(guess, curve, free=("dissipative_constant", "tangential_restitution"))
+right = jaxgran.fit(jaxgran.Measurement(guess, curve, num_particles=3000), free=("A", "beta_t"))
 for name, result in (("as smooth spheres", wrong), ("as rough spheres", right)):
     A, error = result.value("dissipative_constant")
     print(f"{name:>18}: A = {A:.3g} +- {error:.1g} s (true: 3e-06 s), p = {result.p_value:.2g}")
@@ -77,5 +77,5 @@ plt.show()
 # %% [markdown]
 # The first fit returns an $A$ that is six times too large, with a small error bar. Its tiny p-value
 # says that something is missing, but not what; here the curve of $T_\mathrm{rot}$ says it. Measure
-# what you can, name what you know of the scene, and read the alternatives that `diagnose` lists.
+# what you can, name what you know of the scene, and read the alternatives that the fit lists.
 # `jaxgran.WhiteNoise` adds a drive, whose steady state `jaxgran.steady_state` returns.

@@ -17,8 +17,8 @@ import jaxgran
 from experiments.support.record import DATA
 
 jax.config.update("jax_enable_x64", True)
-curve, header = jaxgran.read_curve(DATA / "lammps_cooling_dilute.csv")
-grains = jaxgran.read_gas(header)
+measurement = jaxgran.read_measurement(DATA / "lammps_cooling_dilute.csv")
+grains, curve = measurement.gas, measurement.curve
 
 # %% [markdown]
 # The knots of the spline span the speeds of the impacts that cool the gas. In the fit,
@@ -29,8 +29,7 @@ grains = jaxgran.read_gas(header)
 low, high = jaxgran.RestitutionSpline.visited_speeds(curve.temperature)
 law = jaxgran.RestitutionSpline(jnp.geomspace(low, high, 8))
 learner = dataclasses.replace(grains, law=law)
-known = {"num_particles": int(header["N"]), "replicas": int(header["replicas"])}
-result = jaxgran.fit(learner, curve, free="law", **known)
+result = jaxgran.fit(dataclasses.replace(measurement, gas=learner), free="law")
 print(f"chi^2 per degree of freedom: {float(result.reduced_chi2):.2g}")
 
 # %% [markdown]
@@ -43,7 +42,7 @@ band = jaxgran.restitution_band(result)
 rough_guess = grains.replace(dissipative_constant=1e-6)
 chi2, p, viscoelastic = band.compare(rough_guess, "dissipative_constant")
 print(f"viscoelastic: {chi2:.2g}, A = {float(viscoelastic.value('dissipative_constant')):.3g} s")
-print(f"A of the simulated grains: {float(header['A']):.3g} s")
+print(f"A of the simulated grains: {float(grains.dissipative_constant):.3g} s")
 same = dataclasses.replace(grains, law=jaxgran.ConstantRestitution(0.9))
 chi2, p, _ = band.compare(same, "coefficient")
 print(f"constant restitution: {chi2:.2g}")
@@ -55,7 +54,7 @@ print(f"constant restitution: {chi2:.2g}")
 # %%
 v = jnp.geomspace(low / 3, 2 * high, 100)
 band = jaxgran.restitution_band(result, v)
-true = grains.replace(dissipative_constant=float(header["A"])).restitution(v)
+true = grains.restitution(v)
 shape = {"figsize": (6, 5), "height_ratios": [3, 1], "layout": "constrained"}
 fig, (top, bottom) = plt.subplots(2, sharex=True, **shape)
 top.axvspan(low, high, color="#999999", alpha=0.12)

@@ -15,7 +15,8 @@ from cyclopts import App, CycloptsError, Parameter
 
 import jaxgran
 from jaxgran.cli import common
-from jaxgran.data.files import check_writable, header_count, header_number, name_in_errors
+from jaxgran.data.files import check_writable, header_count, name_in_errors
+from jaxgran.data.header import gas_of_header
 from jaxgran.data.tables import header_in_si, read_text
 from jaxgran.models.choose import NUM_PARTICLES, default_models
 
@@ -179,13 +180,16 @@ def _read_scene(path: Path, until: float | None) -> SimpleNamespace:
             except tomllib.TOMLDecodeError as error:
                 raise ValueError(f"not TOML ({error}). Write lines such as eta = 0.05.") from None
             header = header_in_si({key: str(value) for key, value in values.items()})
+            gas, questions = gas_of_header(header)
+        for question in questions:
+            warnings.warn(f"{path}: {question}", stacklevel=2)
     else:
-        curve, header = jaxgran.read_curve(path)
-        times = curve.times
+        measurement = jaxgran.read_measurement(path)
+        header = dict(measurement.header)
+        gas = measurement.gas
+        times = measurement.curve.times
     if "A" not in header:
         raise ValueError(f"{path} does not give A, in s. Add it, or estimate it with jaxgran fit.")
-    gas = jaxgran.read_gas(header)
-    gas = gas.replace(dissipative_constant=header_number(header, "A"))
     if until is not None:
         first = float(gas.mean_free_time) / 10
         if not first < until < float("inf"):

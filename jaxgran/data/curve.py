@@ -16,11 +16,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from jaxgran._utils.formatting import format_quantity, text_table
-from jaxgran._utils.tracing import any_traced
 from jaxgran._utils.validation import list_to_array
 
 
@@ -170,18 +168,15 @@ class CoolingCurve(eqx.Module):
     status: Int[Array, ""] | None = None
 
     def __repr__(self) -> str:
-        first = last = ratio = ""
-        if not any_traced((self.times, self.temperature)):
-            first, last = (format_quantity(np.asarray(self.times)[..., i], "s") for i in (0, -1))
-            T = np.asarray(self.temperature)
-            ratio = format_quantity(T[..., -1] / T[..., 0])
-            first, last = f", t = {first}", f" to {last}"
+        first = format_quantity(self.times[..., 0], "s")
+        last = format_quantity(self.times[..., -1], "s")
+        ratio = format_quantity(self.temperature[..., -1] / self.temperature[..., 0])
         known = [f.name for f in dataclasses.fields(self) if getattr(self, f.name) is not None]
-        rows = [("T over its first value", ratio or "traced")]
+        rows = [("T over its first value", ratio)]
         rows += [("known", ", ".join(name for name in known if name not in ("times", "status")))]
         if self.status is not None:
             rows.append(("status", format_quantity(self.status)))
-        title = f"CoolingCurve of {np.shape(self.times)[-1]} times{first}{last}"
+        title = f"CoolingCurve of {np.shape(self.times)[-1]} times, t = {first} to {last}"
         return text_table(title, rows)
 
     def to_xarray(self) -> Any:
@@ -283,7 +278,6 @@ class CoolingCurve(eqx.Module):
         """Check that this can be a measured curve: finite and positive values, increasing times.
 
         At t = 0, where the state of the gas was prepared, an error and a displacement may be 0.
-        Traced curves are not checked.
 
         Args:
             place: returns the name of a point, given its index, for error messages.
@@ -291,8 +285,6 @@ class CoolingCurve(eqx.Module):
         Raises:
             ValueError: naming the first wrong point, and saying what to do.
         """
-        if isinstance(self.times, Tracer) or isinstance(self.temperature, Tracer):
-            return
         times = np.asarray(self.times)
         if times.ndim != 1 or times.size < MIN_POINTS:
             raise ValueError(
@@ -301,7 +293,7 @@ class CoolingCurve(eqx.Module):
             )
         for quantity in QUANTITIES.values():
             values = getattr(self, quantity.field)
-            if values is None or isinstance(values, Tracer):
+            if values is None:
                 continue
             if np.shape(values) != times.shape:
                 raise ValueError(

@@ -64,11 +64,28 @@ class Table(NamedTuple):
         header: values of the lines ``# key: value``, by key, without units.
         columns: numbers of each column, by its name.
         lines: line number of each row, counted from 1.
+        cells: the columns as they were written.
+        factors: the value in SI of the unit of each column.
     """
 
     header: dict[str, str]
     columns: dict[str, Float[np.ndarray, "rows"]]
     lines: list[int]
+    cells: dict[str, list[str]]
+    factors: dict[str, float]
+
+    def last_digits(self, name: str) -> Float[np.ndarray, "rows"]:
+        """Return the last digit with which the numbers of a column were written, in SI.
+
+        Zeros at the end may be missing: all numbers have as many decimals, or as many significant
+        digits, as the one that has most of them.
+        """
+        places = np.array([_places(cell) for cell in self.cells[name]])
+        decimals, first = places.T
+        significant = np.max(decimals + first)
+        return self.factors[name] * np.maximum(
+            10.0 ** -np.max(decimals), 10.0 ** (first - significant)
+        )
 
 
 def read_text(path: Path, columns: str) -> str:
@@ -99,7 +116,10 @@ def read_text(path: Path, columns: str) -> str:
 
 
 def read_table(
-    path: Path, wanted: str, columns_to_read: Callable[[list[str]], Iterable[str]]
+    path: Path,
+    wanted: str,
+    columns_to_read: Callable[[list[str]], Iterable[str]],
+    given: dict[str, str],
 ) -> Table:
     """Read header lines, a line of names, and rows of finite numbers.
 
@@ -108,6 +128,7 @@ def read_table(
         wanted: the names of its columns, for messages.
         columns_to_read: from the names of the columns without units, those whose numbers are read;
             raises ValueError for wrong names.
+        given: entries of the header, with or without units, that replace those of the file.
 
     Raises:
         ValueError: saying what is wrong, in which line, and what to do.
@@ -129,6 +150,7 @@ def read_table(
             rows[i] = _split(line, separator, len(names))
     if not names:
         raise ValueError(f"line {i}: the file ends without columns; it needs {wanted}")
+    header |= given
     units = _pop_units(header)
     told = [_name_and_unit(name) for name in names]
     bare_names = [name for name, _ in told]
@@ -153,8 +175,25 @@ def read_table(
                 f"{SEPARATORS[separator]}, got {separator.join(row)!r}; {advice}"
             )
     columns = np.reshape(values, (len(rows), len(at))).T * np.array([[factors[k]] for k in at])
-    header = _convert_header(header, units, comma)
-    return Table(header, dict(zip(chosen, columns, strict=True)), list(rows))
+    return Table(
+        _convert_header(header, units, comma),
+        dict(zip(chosen, columns, strict=True)),
+        list(rows),
+        {name: [row[k] for row in rows.values()] for name, k in zip(chosen, at, strict=True)},
+        {name: factors[k] for name, k in zip(chosen, at, strict=True)},
+    )
+
+
+def _places(cell: str) -> tuple[int, int]:
+    """Return the number of decimals of a number, and the place of its first digit before them.
+
+    Of 12.30 these are 2 and 2, of 0.0123 they are 4 and -1, of 1.2e-3 also 4 and -2.
+    """
+    mantissa, _, exponent = cell.lower().replace("d", "e").replace(",", ".").partition("e")
+    whole, _, decimals = mantissa.strip("+-").partition(".")
+    power = int(exponent or 0)
+    digits = (whole + decimals).lstrip("0")
+    return len(decimals) - power, len(digits) - len(decimals) + power
 
 
 def _split(line: str, separator: str, length: int) -> list[str]:

@@ -11,7 +11,8 @@ import scipy
 from jaxtyping import Array, Float
 
 from jaxgran._utils.validation import POSITIVE
-from jaxgran.fitting.parameters import residuals_and_slopes, with_floats
+from jaxgran.data.curve import CoolingCurve
+from jaxgran.fitting.parameters import as_floats, residuals_and_slopes, with_floats
 from jaxgran.fitting.result import Fit
 from jaxgran.scene.gas import Gas, law_fields
 from jaxgran.scene.laws import RestitutionSpline
@@ -42,6 +43,10 @@ class RestitutionBand(NamedTuple):
             (`RestitutionSpline.visited_speeds`); outside it eps follows from the form of the law
             and its prior.
         covariance: of ln(-ln eps) at the speeds.
+
+    >>> band = jaxgran.restitution_band(result)
+    >>> bool(band.low[0] < band.restitution[0] < band.high[0])
+    True
     """
 
     speeds: Float[np.ndarray, "speeds"]
@@ -68,20 +73,20 @@ class RestitutionBand(NamedTuple):
         measured, domain = np.log(-np.log(self.restitution)), gas.domains[free]
 
         def residuals(flat: np.ndarray) -> np.ndarray:
-            changed = with_floats(gas, {free: domain.from_free(flat[0])})
+            changed = with_floats(gas, as_floats({free: domain.from_free(flat[0])}))
             return whiten @ (np.asarray(_log_loss(changed, jnp.asarray(self.speeds))) - measured)
 
         first = np.ravel(domain.to_free(np.asarray(gas.value(free))))
         solution = scipy.optimize.least_squares(residuals, first)
         degrees, chi2 = int(known.sum()) - 1, 2 * float(solution.cost)
-        fitted = with_floats(gas, {free: domain.from_free(solution.x[0])})
+        fitted = gas.replace(**{free: domain.from_free(solution.x[0])})
         return chi2 / degrees, float(scipy.stats.chi2.sf(chi2, degrees)), fitted
 
 
 def visited_speeds(result: Fit) -> tuple[float, float]:
     """Return the range of impact speeds that determines the measured curves of a fit, m/s."""
-    data = list(result.data.values()) if isinstance(result.data, dict) else [result.data]
-    parts = [np.asarray(x.temperature) for x in data if hasattr(x, "temperature")]
+    data = [m.data for m in result.measurements.values()]
+    parts = [np.asarray(x.temperature) for x in data if isinstance(x, CoolingCurve)]
     if not parts:
         raise ValueError("drop tests alone have no T: give a cooling curve, too")
     return RestitutionSpline.visited_speeds(np.concatenate(parts))
@@ -129,10 +134,12 @@ def restitution_band(result: Fit, speeds: Any = None) -> RestitutionBand:
     POSITIVE.check("speeds", speeds, "Give normal impact speeds in m/s.")
     v = np.asarray(speeds, float)
     law = jax.tree_util.Partial(_log_loss, speeds=jnp.asarray(np.append(v, grid)))
-    log, slopes = residuals_and_slopes(law, gas, {name: gas.value(name) for name in own})
+    floats = {name: gas.value(name) for name in own}
+    log, slopes = residuals_and_slopes(law, gas, floats)
     parts = [np.asarray(slopes[name]) for name in own]
-    at = [i for name in own for i, of in enumerate(result._element_names) if of == name]
-    slope, covariance = np.concatenate(parts, axis=1), np.asarray(result.covariance)[np.ix_(at, at)]
+    at = [i for name in own for i, of in enumerate(result.names_of_elements) if of == name]
+    slope = np.concatenate(parts, axis=1)
+    covariance = result.covariance[np.ix_(at, at)]
     covariance = slope @ covariance @ slope.T
     error = np.sqrt(np.diag(covariance))
     # Quantile of the largest of the standardised errors at the speeds of the grid.

@@ -1,4 +1,7 @@
-"""Parameters of a fit: their unconstrained scale, initial guesses from the data, and priors."""
+"""Parameters of a fit: their unconstrained scale, initial guesses from the data, and priors.
+
+All of it works on known numbers, arrays of NumPy.
+"""
 
 from collections.abc import Callable
 from math import prod
@@ -10,20 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxgran._utils.tracing import any_traced, array_module
-from jaxgran._utils.validation import POSITIVE, Domain
+from jaxgran._utils.validation import Domain
 from jaxgran.data.curve import CoolingCurve
-from jaxgran.data.curve_file import DropTest
+from jaxgran.data.drop_test import DropTest
+from jaxgran.data.measurement import DENSITY, START_TIME, Priors, prior_domain
 from jaxgran.scene.gas import Gas, law_fields
 from jaxgran.scene.laws import C1, ConstantRestitution, RestitutionSpline, Viscoelastic
 from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
-
-START_TIME = "t0"
-"""Name of the time, on the clock of the measurement, at which the gas had its temperature T_0 and
-began to cool: the only free parameter that is not a float of a gas."""
-
-DENSITY = "density"
-"""Name of a prior that is not of a float of a gas: the mass over the volume of a sphere."""
 
 LAW = "law"
 """Name that stands for all floats of the law of restitution."""
@@ -34,11 +30,6 @@ SHARED = ""
 SMOOTHNESS = "smoothness"
 """Name of the prior that a law of restitution brings."""
 
-ANY_TIME = Domain()
-
-Numbers = Any
-"""An array of NumPy, or of JAX under a transformation."""
-
 
 def domain_of(gas: Gas, name: str) -> Domain:
     """Return the allowed values of a parameter.
@@ -47,7 +38,7 @@ def domain_of(gas: Gas, name: str) -> Domain:
         ValueError: for an unknown name; the message lists the known ones.
     """
     if name == START_TIME:
-        return ANY_TIME
+        return Domain()
     gas.value(name)
     return gas.domains[name]
 
@@ -67,16 +58,21 @@ def with_names_of_law(names: Any, gas: Gas) -> Any:
     return tuple(dict.fromkeys(name for part in parts for name in part))
 
 
-def with_floats(gas: Gas, values: dict[str, Any], xp: Any = jnp) -> Gas:
-    """Return a gas with new values of some floats, arrays of xp; ranges are not checked."""
+def with_floats(gas: Gas, values: dict[str, Any]) -> Gas:
+    """Return a gas with new values of some floats, of any type of array; ranges are not checked."""
     if not values:
         return gas
     fields = gas._float_fields
     leaves, structure = jax.tree.flatten(gas)
     positions = structure.unflatten(range(len(leaves)))
     for name, value in values.items():
-        leaves[fields[name].get(positions)] = xp.asarray(value, jnp.result_type(float))
+        leaves[fields[name].get(positions)] = value
     return structure.unflatten(leaves)
+
+
+def as_floats(values: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Return known values as NumPy arrays of the default float type, by name."""
+    return {name: np.asarray(x, jnp.result_type(float)) for name, x in values.items()}
 
 
 class Unknown(NamedTuple):
@@ -121,31 +117,28 @@ def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
         curve: the measured curve.
         free: names of the free parameters.
     """
-    xp = array_module(gas, curve)
-    times, T = xp.asarray(curve.times), xp.asarray(curve.temperature)
+    times, T = np.asarray(curve.times), np.asarray(curve.temperature)
     power, line = _power_and_line(gas, curve)
-    scale, origin = T[0], (xp.asarray(gas.temperature) / T[0]) ** -power
+    scale, origin = T[0], (np.asarray(gas.temperature) / T[0]) ** -power
     values: dict[str, Any] = {}
     if "temperature" in free:
         origin, slope = _intercept_and_slope(times, line)
         values["temperature"] = scale * origin ** (-1 / power)
     elif START_TIME in free:
-        _, slope = _intercept_and_slope(times, line)
+        _, slope = _intercept_and_slope(times - times[0], line)
     else:
         weight = 1 / line
-        slope = xp.sum(weight**2 * (line - origin) * times) / xp.sum((weight * times) ** 2)
-    rate = xp.maximum(slope / origin, 1e-9 / times[-1])
-    values |= _guess_law(with_floats(gas, values), rate, free)
+        slope = np.sum(weight**2 * (line - origin) * times) / np.sum((weight * times) ** 2)
+    rate = np.maximum(slope / origin, 1e-9 / times[-1])
+    values |= _guess_law(with_floats(gas, as_floats(values)), rate, free)
     values |= _guess_elements(gas, curve, free)
-    return with_floats(gas, {name: x for name, x in values.items() if name in free})
+    return with_floats(gas, as_floats({name: x for name, x in values.items() if name in free}))
 
 
 def guess_from_drops(gas: Gas, test: DropTest, free: tuple[str, ...]) -> Gas:
-    """Return the gas with A as in ``eps = exp(-C1 beta)`` of the median impact, if it was 0."""
+    """Return the gas with A as in ``eps = exp(-C1 beta)`` of the median impact."""
     law = gas.law
     if not isinstance(law, Viscoelastic) or "dissipative_constant" not in free:
-        return gas
-    if any_traced(gas, test) or law.dissipative_constant > 0:
         return gas
     speed, eps = np.median(np.asarray(test.speed)), np.median(np.asarray(test.restitution))
     law = law.of_wall() if test.onto_plate else law
@@ -154,21 +147,20 @@ def guess_from_drops(gas: Gas, test: DropTest, free: tuple[str, ...]) -> Gas:
     return gas.replace(dissipative_constant=loss / (1.5 * C1 * alpha**0.4 * speed**0.2))
 
 
-def _guess_law(gas: Gas, rate: Numbers, free: tuple[str, ...]) -> dict[str, Any]:
-    xp = array_module(gas, rate)
-    mean_free_time, alpha, loss_now = map(xp.asarray, _law_scales(gas))
+def _guess_law(gas: Gas, rate: Any, free: tuple[str, ...]) -> dict[str, Any]:
+    mean_free_time, alpha, loss_now = map(np.asarray, _law_scales(gas))
     rate = rate * mean_free_time
-    loss = xp.clip(2 * gas.dimension * rate, 1e-6, 0.99)
+    loss = np.clip(2 * gas.dimension * rate, 1e-6, 0.99)
     if isinstance(gas.law, ConstantRestitution) and "coefficient" in free:
-        return {"coefficient": xp.sqrt(1 - loss)}
+        return {"coefficient": np.sqrt(1 - loss)}
     if isinstance(gas.law, RestitutionSpline) and "drops" in free:
-        return {"drops": xp.asarray(gas.law.drops) * (-xp.log1p(-loss) / 2 / loss_now)}
+        return {"drops": np.asarray(gas.law.drops) * (-np.log1p(-loss) / 2 / loss_now)}
     if isinstance(gas.law, Viscoelastic) and "dissipative_constant" in free:
         delta = rate / COOLING_RATE[gas.dimension]
         # To the next order in delta the cooling rate is that of delta (1 - q delta / 2): invert it.
         correction = 0.5 * COOLING_CORRECTION * delta
-        delta = delta / (1 - xp.minimum(correction, 0.7))
-        T_0 = xp.asarray(gas.temperature)
+        delta = delta / (1 - np.minimum(correction, 0.7))
+        T_0 = np.asarray(gas.temperature)
         return {"dissipative_constant": delta / (alpha**0.4 * T_0**0.1)}
     return {}
 
@@ -187,15 +179,16 @@ def _law_scales(gas: Gas) -> tuple[Float[Array, ""], Float[Array, ""], Float[Arr
     return gas.mean_free_time, alpha, loss
 
 
-def known_start_time(priors: "dict[str, Priors]", label: str) -> tuple[Numbers, Numbers]:
+def known_start_time(priors: dict[str, Priors], label: str) -> tuple[float, float]:
     """Return the t0 that priors give for a measurement and its error, s, or 0 and infinity."""
     both = {**priors.get(label, {}), **priors.get(SHARED, {})}
-    return both.get(START_TIME, (0.0, np.inf))
+    value, error = both.get(START_TIME, (0.0, np.inf))
+    return float(value), float(error)
 
 
 def guess_start_time(
-    gas: Gas, curve: CoolingCurve, free: tuple[str, ...], known: tuple[Numbers, Numbers]
-) -> Numbers:
+    gas: Gas, curve: CoolingCurve, free: tuple[str, ...], known: tuple[float, float]
+) -> float:
     """Return the time, s, at which the line of `guess_from_data` gives the T_0 of a gas.
 
     It is the known one if t0 is not free, or if T_0 is free too, and within 3 errors of it.
@@ -203,37 +196,41 @@ def guess_start_time(
     t0, error = known
     if START_TIME not in free or "temperature" in free:
         return t0
-    xp = array_module(gas, curve, known)
-    times, T = xp.asarray(curve.times), xp.asarray(curve.temperature)
+    times, T = np.asarray(curve.times), np.asarray(curve.temperature)
+    since = times - times[0]
     power, line = _power_and_line(gas, curve)
-    intercept, slope = _intercept_and_slope(times, line)
-    guess = ((xp.asarray(gas.temperature) / T[0]) ** -power - intercept) / slope
-    guess = xp.clip(xp.where(slope > 0, guess, 0.0), -times[-1], 0.5 * times[-1])
-    return xp.clip(guess, t0 - 3 * error, t0 + 3 * error)
+    intercept, slope = _intercept_and_slope(since, line)
+    guess = ((np.asarray(gas.temperature) / T[0]) ** -power - intercept) / slope
+    guess = times[0] + np.clip(np.where(slope > 0, guess, 0.0), -since[-1], 0.5 * since[-1])
+    return float(np.clip(guess, t0 - 3 * error, t0 + 3 * error))
 
 
-def halving_time(curve: CoolingCurve) -> Numbers:
-    """Return the first time at which T is below half of its first value, or the last time."""
-    xp = array_module(curve)
-    times, T = xp.asarray(curve.times), xp.asarray(curve.temperature)
-    halved = xp.concatenate([T[:-1] < 0.5 * T[0], xp.ones(1, bool)])
-    return times[xp.argmax(halved)]
+def halving_time(curve: CoolingCurve) -> float:
+    """Return the time from the first point to that below half of its T, or to the last one."""
+    times, T = np.asarray(curve.times), np.asarray(curve.temperature)
+    halved = np.concatenate([T[:-1] < 0.5 * T[0], np.ones(1, bool)])
+    return float(times[np.argmax(halved)] - times[0])
 
 
-def _power_and_line(gas: Gas, curve: CoolingCurve) -> tuple[float, Numbers]:
+def _power_and_line(gas: Gas, curve: CoolingCurve) -> tuple[float, np.ndarray]:
     """Return the negative power of T that is a straight line in time, and that line, 1 at first."""
-    T = array_module(curve).asarray(curve.temperature)
-    power = 1 / 2 if isinstance(gas.law, ConstantRestitution) else 3 / 5
+    T = np.asarray(curve.temperature)
+    power = power_of_line(gas)
     return power, (T / T[0]) ** -power
 
 
-def _intercept_and_slope(times: Numbers, line: Numbers) -> tuple[Numbers, Numbers]:
+def power_of_line(gas: Gas) -> float:
+    """Return p for which T^(-p) of a cooling gas is a straight line in time."""
+    return 1 / 2 if isinstance(gas.law, ConstantRestitution) else 3 / 5
+
+
+def _intercept_and_slope(times: np.ndarray, line: np.ndarray) -> tuple[Any, Any]:
     """Fit a straight line by least squares with equal relative errors."""
-    xp, weight = array_module(times, line), 1 / line
-    design = xp.stack([weight, weight * times], axis=1)
-    size = xp.linalg.norm(design, axis=0)
-    intercept, slope = xp.linalg.lstsq(design / size[None], weight * line, rcond=None)[0] / size
-    return xp.maximum(intercept, 0.1 * line.min()), slope
+    weight = 1 / line
+    design = np.stack([weight, weight * times], axis=1)
+    size = np.linalg.norm(design, axis=0)
+    intercept, slope = np.linalg.lstsq(design / size[None], weight * line, rcond=None)[0] / size
+    return np.maximum(intercept, 0.1 * line.min()), slope
 
 
 def _guess_elements(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> dict[str, Any]:
@@ -243,63 +240,26 @@ def _guess_elements(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> dic
     t = 0 the first measured one or a tenth of T_0, and that of a drag rate a tenth of the mean
     cooling rate.
     """
-    xp, measured = array_module(gas, curve), curve.rotational_temperature
-    times, T, T_0 = (xp.asarray(x) for x in (curve.times, curve.temperature, gas.temperature))
+    measured = curve.rotational_temperature
+    times, T, T_0 = (np.asarray(x) for x in (curve.times, curve.temperature, gas.temperature))
     T_rot = 0.1 * T_0
     if measured is not None:
-        T_rot = xp.maximum(xp.asarray(measured)[0], xp.asarray(measured)[1])
-    drag = 0.1 * xp.maximum(xp.log(T[0] / T[-1]) / times[-1], 1e-9 / times[-1])
+        T_rot = np.maximum(np.asarray(measured)[0], np.asarray(measured)[1])
+    drag = 0.1 * np.maximum(np.log(T[0] / T[-1]) / times[-1], 1e-9 / times[-1])
     guesses = {
-        "tangential_restitution": xp.zeros(()),
-        "rotational_temperature": xp.maximum(T_rot, 1e-6 * T_0),
-        "wall_coefficient": xp.full((), 0.8),
-        "wall_tangential_restitution": xp.zeros(()),
+        "tangential_restitution": np.zeros(()),
+        "rotational_temperature": np.maximum(T_rot, 1e-6 * T_0),
+        "wall_coefficient": np.full((), 0.8),
+        "wall_tangential_restitution": np.zeros(()),
         "drag_rate": drag,
         "drag_rotational_rate": drag,
     }
     values = {}
     for name in guesses.keys() & set(free):
-        value = xp.asarray(gas.value(name))
-        at_end = ~xp.isfinite(gas.domains[name].to_free(value))
-        values[name] = xp.where(at_end, guesses[name], value)
+        value = np.asarray(gas.value(name))
+        at_end = ~np.isfinite(gas.domains[name].to_free(value))
+        values[name] = np.where(at_end, guesses[name], value)
     return values
-
-
-Priors = dict[str, tuple[Float[Array, "..."], Float[Array, "..."]]]
-"""Known values and their standard errors, SI, by the name of a float of a gas, or "density", which
-lets the mass vary, "t0", the time at which the gas began to cool, or "smoothness", which stands for
-`jaxgran.RestitutionLaw.prior_residuals`. Each prior is Gaussian in the unconstrained scale (the
-logarithm of a positive float)."""
-
-
-def checked_priors(gas: Gas, priors: dict[str, Any]) -> Priors:
-    """Check and convert the priors that a user gave.
-
-    Raises:
-        ValueError: for an unknown name, a value outside its range or an error that is not positive.
-    """
-    for name, pair in priors.items():
-        if name not in (DENSITY, START_TIME) and name not in gas.domains:
-            raise ValueError(
-                f"priors: no float {name!r} in this gas; it has {', '.join(gas.domains)}, and "
-                f"{DENSITY} and {START_TIME}"
-            )
-        if not isinstance(pair, tuple | list) or len(pair) != 2:
-            raise ValueError(
-                f"priors: {name} needs (value, standard error), as (0.05, 0.002), got {pair!r:.60}"
-            )
-        if any_traced(pair):
-            continue
-        (value, error), domain = pair, _prior_domain(gas, name)
-        domain.check(f"priors: {name}", value, "Give the known value, in SI units.")
-        advice = "Leave out values that are known exactly."
-        POSITIVE.check(f"priors: standard error of {name}", error, advice)
-        if not np.all(np.isfinite(domain.to_free(np.asarray(value, float)))):
-            raise ValueError(
-                f"priors: {name} = {value} lies on the end of its range {domain}: give a value "
-                "inside the range"
-            )
-    return {name: (jnp.asarray(pair[0]), jnp.asarray(pair[1])) for name, pair in priors.items()}
 
 
 def extra_parameters(priors: Priors, free: tuple[str, ...]) -> tuple[str, ...]:
@@ -309,8 +269,8 @@ def extra_parameters(priors: Priors, free: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def prior_residuals(
-    priors: Priors, gas: Gas, values: dict[str, Numbers]
-) -> dict[str, tuple[Numbers, dict[str, Numbers]]]:
+    priors: Priors, gas: Gas, values: dict[str, Any]
+) -> dict[str, tuple[np.ndarray, dict[str, np.ndarray]]]:
     """Return (value - known value) / standard error of each prior, and its derivatives.
 
     Both are in the unconstrained scale; the derivatives are those in SI values, shape (size, size),
@@ -321,18 +281,18 @@ def prior_residuals(
         gas: the scene, for floats that are not varied.
         values: SI values of the parameters that are varied, by name.
     """
-    xp, rows = array_module(priors, gas, values), {}
+    rows = {}
     for name, (given, error) in priors.items():
         if name == SMOOTHNESS:
             floats = {n: jnp.asarray(values[n]) for n in law_fields(gas.law) if n in values}
             row = residuals_and_slopes(_law_prior, gas, floats)
-            rows[name] = jax.tree.map(xp.asarray, row)
+            rows[name] = jax.tree.map(np.asarray, row)
             continue
-        domain, given, error = _prior_domain(gas, name), xp.asarray(given), xp.asarray(error)
+        domain, given, error = prior_domain(gas, name), np.asarray(given), np.asarray(error)
         width = error / domain.slope(given)
 
-        def value_of(name: str) -> Numbers:
-            return xp.asarray(values[name] if name in values else gas.value(name))
+        def value_of(name: str) -> np.ndarray:
+            return np.asarray(values[name] if name in values else gas.value(name))
 
         if name == DENSITY:
             mass, diameter = value_of("mass"), value_of("diameter")
@@ -341,9 +301,9 @@ def prior_residuals(
         else:
             value = value_of(name)
             slopes = {name: 1 / (domain.slope(value) * width)}
-        row = xp.ravel((domain.to_free(value) - domain.to_free(given)) / width)
+        row = np.ravel((domain.to_free(value) - domain.to_free(given)) / width)
         diagonal = {
-            key: xp.diag(xp.broadcast_to(xp.ravel(slope), row.shape))
+            key: np.diag(np.broadcast_to(np.ravel(slope), row.shape))
             for key, slope in slopes.items()
             if key in values
         }
@@ -367,7 +327,3 @@ def residuals_and_slopes(
 
     slopes, values = jax.jacfwd(residuals, has_aux=True)(floats)
     return values, {name: slope.reshape(values.size, -1) for name, slope in slopes.items()}
-
-
-def _prior_domain(gas: Gas, name: str) -> Domain:
-    return POSITIVE if name == DENSITY else domain_of(gas, name)

@@ -5,6 +5,8 @@ from abc import abstractmethod
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from equinox import AbstractClassVar
 from jaxtyping import Array, Float
@@ -35,10 +37,10 @@ class Limitation(NamedTuple):
 class AbstractModel(eqx.Module):
     """A model of a cooling gas: a description, without state and without the options of a run.
 
-    A subclass defines the members below; it then works in `jaxgran.cool`, `jaxgran.fit`,
-    `jaxgran.choose_model` and `jaxgran.diagnose`, which use no other members. Numbers that a
-    user may differentiate or sweep are array fields, counts and choices are static fields. If a
-    member is missing, creating the model raises a TypeError that names it.
+    A subclass defines the members below; it then works in `jaxgran.cool`, `jaxgran.fit` and
+    `jaxgran.choose_model`, which use no other members. Numbers that a user may differentiate or
+    sweep are array fields, counts and choices are static fields. If a member is missing, creating
+    the model raises a TypeError that names it.
 
     `jaxgran.DSMC` is a short example; `experiments/fit/own_model.py` defines one in 25 lines.
 
@@ -84,15 +86,39 @@ class AbstractModel(eqx.Module):
                 )
         self.check(gas)
 
-    def curve_in_fit(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> CoolingCurve:
+    def solve(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> CoolingCurve:
         """Return the curve inside the compiled program of a fit: by default that of `simulate`.
 
         A model that solves equations multiplies its tolerance by `tolerance`.
         """
         return self.simulate(gas, times, Run())
 
-    def for_fits(self, *gases: Gas) -> "AbstractModel":
-        """Return the model that computes the curves of some gases in fits: by default this one."""
+    def solve_along(
+        self, gas: Gas, times: Float[Array, "times"], tolerance: Any, gas_along: Gas, delay: Any
+    ) -> tuple[CoolingCurve, CoolingCurve]:
+        """Return the curve of `solve`, and its derivatives along some directions.
+
+        Args:
+            gas, times, tolerance: as of `solve`.
+            gas_along: tangents of the gas, with a first axis (directions,).
+            delay: tangents of a shift of all times, shape (directions,).
+        """
+
+        def curve(gas: Gas, shift: Array) -> CoolingCurve:
+            return self.solve(gas, times + shift, tolerance)
+
+        def along(gas_along: Gas, delay: Array) -> tuple[CoolingCurve, CoolingCurve]:
+            return jax.jvp(curve, (gas, jnp.zeros((), times.dtype)), (gas_along, delay))
+
+        return jax.vmap(along, out_axes=(None, 0))(gas_along, delay)
+
+    def simplified_for(self, *gases: Gas, displacement: bool = False) -> "AbstractModel":
+        """Return the model that computes the curves of some gases in fits: by default this one.
+
+        Args:
+            gases: the scenes.
+            displacement: whether <dr^2> is needed.
+        """
         return self
 
     def sized_for(self, gas: Gas, spare: float = 2.0) -> "AbstractModel":

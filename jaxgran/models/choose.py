@@ -22,7 +22,6 @@ from jaxgran.models.checks import (
     check_volume,
     checked_gas,
     describe_walls,
-    first_cooling_rate,
 )
 from jaxgran.models.dsmc import DSMC
 from jaxgran.models.error_model import ErrorModel, flow_share
@@ -30,8 +29,8 @@ from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.linearise import curve_of_program
 from jaxgran.models.soft_spheres import SoftSpheres
-from jaxgran.scene.gas import Gas, reduced_scene
-from jaxgran.theory.equations import Spins, element_rates, softness_factor
+from jaxgran.scene.gas import Gas
+from jaxgran.theory.equations import softness_factor
 
 NUM_PARTICLES = 4000
 """Particles of a particle model if the user gives no number."""
@@ -217,10 +216,8 @@ def error_model_along(
         "collisions": zero if curve.collisions is None else curve.collisions,
         "sonine": zero if curve.sonine is None else curve.sonine,
     }
-    size, rotation = temperature.size, curve.rotational_temperature
-    if rotation is None:
-        rotation = gas.value("rotational_temperature") + zero if gas.surface is not None else zero
-    scales = _scales(gas, *(pad_to(x, grid_size(size)) for x in (temperature, rotation)))
+    size = temperature.size
+    scales = _scales(gas, pad_to(temperature, grid_size(size)))
     scales = {name: np.asarray(value)[:size] for name, value in scales.items()}
     values = {name: np.asarray(value, float) for name, value in (values | scales).items()}
     critical, flow = values.pop("critical_box"), np.zeros_like(values["time"])
@@ -231,42 +228,18 @@ def error_model_along(
 
 
 @eqx.filter_jit
-def _scales(
-    gas: Gas, temperature: Float[Array, "times"], rotation: Float[Array, "times"]
-) -> dict[str, Float[Array, "times"]]:
-    def scales(temperature, rotation):
+def _scales(gas: Gas, temperature: Float[Array, "times"]) -> dict[str, Float[Array, "times"]]:
+    def scales(temperature):
         now = gas.replace(temperature=temperature)
-        shares = _shares_of_losses(now, rotation / temperature)
         factor = softness_factor(now.reduced_law, jnp.ones_like(temperature), now.dimension)
-        scales = {
+        return {
             "contact_fraction": now.contact_fraction,
             "overlap": now.mean_overlap,
             "softness": 1 - factor,
             "critical_box": now.critical_box,
         }
-        return scales | dict(zip(("impact_share", "normal_share"), shares, strict=True))
 
-    return jax.vmap(scales)(temperature, rotation)
-
-
-def _shares_of_losses(now: Gas, ratio: Float[Array, ""]) -> tuple[Array, Array]:
-    """Return the shares of impacts in all losses, and of normal losses in those of impacts."""
-    one = jnp.ones_like(now.temperature)
-    if now.container is None and now.drag is None and now.surface is None:
-        return one, one
-    scene, state = reduced_scene(now), (Spins.gaussian(ratio), 0 * one, now.dimension)
-    normal = first_cooling_rate(now)[0] * now.path_length / now.impact_speed
-    alone = scene._replace(walls=None, drag=None, drive=None)
-    tangential, rest = (
-        element_rates(x, one, *state, gaussian_spins=True).cooling for x in (alone, scene)
-    )
-    impacts = normal + tangential
-
-    def share(part, whole):  # 1 where nothing is lost
-        return jnp.where(whole > 0, part / jnp.where(whole > 0, whole, 1.0), 1.0)
-
-    # Spins that heat the gas return more than slip takes.
-    return share(impacts, normal + rest), jnp.clip(share(normal, impacts), 0.0, 1.0)
+    return jax.vmap(scales)(temperature)
 
 
 def _describe_scene(error_model: ErrorModel, size: int, replicas: int) -> list[str]:

@@ -124,13 +124,6 @@ runs; ``experiments/accuracy/gradient_health.py`` measures the last two again, w
 errors.
 """
 
-CHANCE_OF_OTHERS = 0.2
-"""Variance of the clock of elastic spheres that walls cool, over that by impacts between spheres.
-
-Measured: hard spheres, phi = .03, eps = .9, until T has fallen to .3: .15 for N = 60 (333 runs), .2
-for N = 250 (80), .35 for N = 1000 (20). A sphere hits the walls regularly.
-"""
-
 MEASURED_FLOW = 0.65
 """Ratio of the flow in the longest waves of a run to the predicted flow in all modes.
 
@@ -157,8 +150,6 @@ class ErrorModel(NamedTuple):
         contact_fraction: contact duration over mean free time.
         overlap: mean largest overlap, in diameters.
         softness: c X_T/sigma, by which soft contacts slow the cooling.
-        impact_share: share of the losses in impacts between spheres, the rest by walls and drag.
-        normal_share: share of these by the normal velocity; rough spheres lose the rest by slip.
         flow_share: mean share of the kinetic energy in the flow, 0 where the box is unknown.
         flow_scatter: standard deviation of this share between realisations.
 
@@ -177,8 +168,6 @@ class ErrorModel(NamedTuple):
     contact_fraction: Float[np.ndarray, "times"]
     overlap: Float[np.ndarray, "times"]
     softness: Float[np.ndarray, "times"]
-    impact_share: Float[np.ndarray, "times"]
-    normal_share: Float[np.ndarray, "times"]
     flow_share: Float[np.ndarray, "times"]
     flow_scatter: Float[np.ndarray, "times"]
 
@@ -214,25 +203,6 @@ class ErrorModel(NamedTuple):
         """Relative error of the clock, ``int_0^t e dt' / t``, by an error e(t) of the rate."""
         e = np.broadcast_to(rate_error, self.time.shape)
         return np.where(self.time > 0, self._integral(e) / np.where(self.time > 0, self.time, 1), e)
-
-    def chance_of_clock(self, num_particles: int) -> Float[np.ndarray, "times"]:
-        """Variance of the clock, s^2, by the randomness of single collisions of N particles.
-
-        Collisions are a Poisson process of rate N nu/2. The energy lost in each is proportional to
-        the square of the normal speed, which is distributed exponentially: its mean square is twice
-        the square of its mean. A clock that reads the loss then has the variance
-        ``int 4 dt / (N nu)`` (4.4 instead of 4 if ``1 - eps^2`` grows as v^(1/5)). Rough spheres
-        lose a share 1 - n by the slip, whose square has the variance ``2/(d - 1)`` relative to its
-        squared mean and is independent of the normal speed: 2 becomes
-        ``1 + n^2 + 2 (1 - n)^2/(d - 1)``. The factor of losses by walls and drag is
-        `CHANCE_OF_OTHERS`.
-        """
-        frequency = float(self.gas.collision_frequency) * np.exp(self.log_temperature / 2)
-        normal, slip = self.normal_share, 1 - self.normal_share
-        spread = 1 + normal**2 + 2 / (self.gas.dimension - 1) * slip**2
-        share = spread / 2 * self.impact_share**2
-        share = share + CHANCE_OF_OTHERS * (1 - self.impact_share) ** 2
-        return self._integral(4 * share / (num_particles * frequency))
 
     def slope_error(self) -> Float[np.ndarray, "times"]:
         """Relative error of projected derivatives of a particle run by a flow in its box.

@@ -8,23 +8,41 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran._utils import status, validation
-from jaxgran._utils.tracing import any_traced, array_module, in_compiled_code, pad_to, truncate_to
+from jaxgran._utils.tracing import (
+    any_traced,
+    array_module,
+    as_jax_arrays,
+    in_compiled_code,
+    pad_to,
+    truncate_to,
+)
 from jaxgran.data.curve import DEFAULTS, CoolingCurve, Run
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.scene.gas import Gas, reduced_scene
-from jaxgran.theory.equations import SUPPORTED, Density, Equations, softness_factor
-from jaxgran.theory.solver import moments_at, padded_length
+from jaxgran.theory.covariance import run_covariance
+from jaxgran.theory.equations import (
+    SUPPORTED,
+    Density,
+    Equations,
+    Moments,
+    SceneAndDensity,
+    softness_factor,
+)
+from jaxgran.theory.solver import MomentSolver, padded_length
 
 TOLERANCES = validation.Domain(0.0, 0.1)
 """Relative tolerances of the solver."""
 
 SONINES = validation.Domain(-0.4, 1.0)
 """Values of a_2 at t = 0; that of spheres of one speed is -0.4, of disks -0.5."""
+
+NUM_GRID_TIMES = 97
+"""Number of times between which a covariance is propagated, in addition to the given ones."""
 
 SLIDING_ACCURACY = 0.2
 """Relative accuracy of T_rot/T of spheres that slide and rotated at t = 0, or have rough walls."""
@@ -62,6 +80,7 @@ class KineticTheory(AbstractModel):
             spheres).
         correlations: correct for velocity correlations at finite density; with False this is
             Enskog's theory.
+        diffusion: solve for D and <dr^2>.
         spin_cumulants: solve for the cumulants of spins of rough spheres; with False spins and
             velocities stay independent and Gaussian.
         initial_sonine: a_2 at t = 0, in (-0.4, 1); that of `jaxgran.steady_state` for a gas that
@@ -88,6 +107,7 @@ class KineticTheory(AbstractModel):
     order: int = eqx.field(static=True, default=3)
     softness: bool = eqx.field(static=True, default=True)
     correlations: bool = eqx.field(static=True, default=True)
+    diffusion: bool = eqx.field(static=True, default=True)
     spin_cumulants: bool = eqx.field(static=True, default=True)
     initial_sonine: float = eqx.field(static=True, default=0.0)
     rtol: float | None = eqx.field(static=True, default=None)
@@ -99,6 +119,7 @@ class KineticTheory(AbstractModel):
             sonine=self.sonine,
             softness=self.softness,
             correlations=self.correlations,
+            diffusion=self.diffusion,
             spin_cumulants=self.spin_cumulants,
         )
         if self.order not in (2, 3) or isinstance(self.order, bool | float):
@@ -167,6 +188,73 @@ class KineticTheory(AbstractModel):
         """Return ``-d ln T/dt`` at t = 0, 1/s, of a Maxwellian gas; < 0 if the law heats it."""
         return checks.first_cooling_rate(gas)[0]
 
+    def covariance(
+        self, gas: Gas, times: validation.UserNumber, num_particles: int, *, rotation: bool = False
+    ) -> Float[Array, "n n"]:
+        """Return the covariance of ln T of one run of N spheres at some times.
+
+        T of a run departs from the curve of this model because its impacts are random in number
+        and size: ``dC/dt = J C + C J^T + Q/N`` along the curve, ``C(0) = 0``, with the Jacobian J
+        of the rates and the second moments Q of what impacts take (`jaxgran.theory.covariance`).
+        For smooth spheres in a periodic box, with ``zeta = -d ln T/dt`` by impacts, omega
+        collisions per particle and time, ``r = <x^2>/<x>^2`` of their losses x (2 for constant
+        restitution), and ``Phi = d ln T(t)/d ln T_0``,
+
+            C(t_i, t_j) = (2/N) Phi_i Phi_j int_0^min(t_i, t_j) r zeta^2/(omega Phi^2) dt.
+
+        The mean over R independent runs has 1/R of it. It is the covariance of a gas that stays
+        homogeneous, at low density: `jaxgran.models.error_model` has the factors of others.
+
+        Args:
+            gas: the scene; its T_0 is that of the run itself.
+            times: t, s, shape (times,), >= 0, increasing.
+            num_particles: N, >= 1.
+            rotation: give also ln T_rot of rough spheres.
+
+        Returns:
+            C, shape (times, times); with `rotation` of ln T at all times, then of ln T_rot, shape
+            (2 times, 2 times). Differentiable in the gas.
+
+        Raises:
+            ValueError: for times out of order, N below 1, and `rotation` without rough spheres.
+            RuntimeError: if the curve cannot be computed.
+
+        >>> covariance = jaxgran.KineticTheory().covariance(gas, times, 250)
+        >>> [round(float(error), 4) for error in jnp.sqrt(jnp.diag(covariance))]
+        [0.0089, 0.0151, 0.0237, 0.0262]
+        """
+        gas, times = checks.checked_gas(gas), validation.checked_times(times)
+        num_particles = validation.checked_int("num_particles", num_particles, 1)
+        self.check_scene(gas)
+        if rotation and gas.surface is None:
+            raise ValueError(
+                "rotation=True needs spheres that rotate: add surface=jaxgran.Rough(...), or leave "
+                "rotation out."
+            )
+        xp = array_module(gas, times)
+        frequency = xp.asarray(gas.collision_frequency)
+        # T changes little between the times of a grid in ln(1 + t/tau_c).
+        grid = xp.linspace(0.0, 1.0, NUM_GRID_TIMES) * xp.log1p(frequency * times[-1])
+        grid = xp.concatenate([xp.asarray(times), xp.expm1(grid) / frequency])
+        padded = pad_to(xp.sort(grid), padded_length(grid.size))
+        place = xp.searchsorted(padded, xp.asarray(times))
+        whole, fault = self._compiled_covariance(gas, as_jax_arrays(padded), rotation)
+        if not any_traced(fault) and int(fault) != status.OK:
+            raise RuntimeError(status.explain(int(fault)))
+        rows = xp.concatenate([place, place + padded.size]) if rotation else place
+        return whole[rows][:, rows] / num_particles
+
+    @eqx.filter_jit
+    def _compiled_covariance(
+        self, gas: Gas, times: Float[Array, "times"], rotation: bool
+    ) -> tuple[Float[Array, "n n"], Any]:
+        scene, reduced = self._reduced(gas, times)
+        state, fault = self._solver(gas, times, 1.0).moments(scene, reduced)
+        curve = self._curve(gas, times, state, fault)
+        options = {"softness": self.softness, "correlations": self.correlations}
+        whole = run_covariance(gas, curve, state.spins, rotation=rotation, **options)
+        return whole, curve.status
+
     def check(self, gas: Gas) -> None:
         """Raise ValueError if the law heats the gas, or contacts are too soft for the theory."""
         if any_traced(gas):
@@ -197,21 +285,25 @@ class KineticTheory(AbstractModel):
         contacts = checks.limitations_of_instant_impacts(gas, consequence)
         return contacts + checks.limitations_of_homogeneity(gas, num_particles)
 
-    def for_fits(self, *gases: Gas) -> "KineticTheory":
-        """Return this model, with Gaussian spins if the spheres of all gases are smooth.
+    def simplified_for(self, *gases: Gas, displacement: bool = False) -> "KineticTheory":
+        """Return this model without D, and with Gaussian spins if all spheres are smooth.
 
         Then only alternative explanations of their curves rotate. Gaussian spins change T by up to
         2 % there, and the program compiles in two thirds of the time.
         """
         smooth = all(gas.surface is None for gas in gases)
-        return dataclasses.replace(self, spin_cumulants=False) if smooth else self
+        return dataclasses.replace(
+            self,
+            spin_cumulants=self.spin_cumulants and not smooth,
+            diffusion=self.diffusion and displacement,
+        )
 
     def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
         """Return the cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
         size = times.size
         padded = pad_to(times, padded_length(size))
         # Traced twice if it were compiled within another program.
-        computed = self.curve_in_fit if in_compiled_code(gas, times) else self._compiled_curve
+        computed = self.solve if in_compiled_code(gas, times) else self._compiled_curve
         curve = computed(gas, padded, 1.0)
         if gas.container is not None:  # walls would limit <dr^2>
             curve = dataclasses.replace(curve, diffusion=None, displacement=None)
@@ -221,41 +313,97 @@ class KineticTheory(AbstractModel):
     def _compiled_curve(
         self, gas: Gas, times: Float[Array, "times"], tolerance: float
     ) -> CoolingCurve:
-        return self.curve_in_fit(gas, times, tolerance)
+        return self.solve(gas, times, tolerance)
 
-    def curve_in_fit(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> CoolingCurve:
+    def solve(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> CoolingCurve:
         """Return the curve at times on a grid of lengths; <dr^2> as if there were no walls."""
-        length, sound = gas.path_length, jnp.asarray(True)
-        if self.softness:  # a search may try a T_0 at which spheres are too soft: no step is made
-            law, hottest = gas.reduced_law, jnp.ones_like(gas.temperature)
-            sound = softness_factor(law, hottest, gas.dimension) > 0
+        scene, reduced = self._reduced(gas, times)
+        state, fault = self._solver(gas, times, tolerance).moments(scene, reduced)
+        return self._curve(gas, times, state, fault)
+
+    def solve_along(
+        self, gas: Gas, times: Float[Array, "times"], tolerance: Any, gas_along: Gas, delay: Any
+    ) -> tuple[CoolingCurve, CoolingCurve]:
+        """Return `solve`, and its derivatives along some directions of the gas and of the times.
+
+        Args:
+            gas, times, tolerance: as of `solve`.
+            gas_along: tangents of the gas, with a first axis (directions,).
+            delay: tangents of a shift of all times, shape (directions,).
+        """
+        times_along = jnp.broadcast_to(delay[:, None], (*delay.shape, times.size))
+
+        def each(function, *primals):
+            """Return values, and derivatives along each direction."""
+
+            def along(*tangents):
+                return jax.jvp(function, primals, tangents)
+
+            return jax.vmap(along, out_axes=(None, 0))
+
+        reduced = each(self._reduced, gas, times)(gas_along, times_along)
+        (scene, at), (scene_along, at_along) = reduced
+        solver = self._solver(gas, times, tolerance)
+        state, state_along, fault = solver.moments_along(scene, at, scene_along, at_along)
+
+        def curve(gas, times, state):
+            return dataclasses.replace(self._curve(gas, times, state, fault), status=None)
+
+        computed, along = each(curve, gas, times, state)(gas_along, times_along, state_along)
+        whole = self._curve(gas, times, state, fault)
+        return dataclasses.replace(computed, status=whole.status), along
+
+    def _reduced(
+        self, gas: Gas, times: Float[Array, "times"]
+    ) -> tuple[SceneAndDensity, Float[Array, "times"]]:
+        """Return a gas and times in reduced units."""
+        # A search may try a T_0 at which spheres are too soft: no step is made then.
+        sound = self._is_sound(gas)
         scene = reduced_scene(gas), Density.from_gas(gas, self.softness, self.correlations)
+        return scene, jnp.where(sound, times, 0.0) * gas.impact_speed / gas.path_length
+
+    def _is_sound(self, gas: Gas) -> Bool[Array, ""]:
+        if not self.softness:
+            return jnp.asarray(True)
+        law, hottest = gas.reduced_law, jnp.ones_like(gas.temperature)
+        return softness_factor(law, hottest, gas.dimension) > 0
+
+    def _solver(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> MomentSolver:
         rtol = self.rtol or (1e-8 if times.dtype == jnp.float64 else 1e-5)
-        order = self.order if self.sonine else 2
         equations = Equations(
-            gas.dimension, order, not self.sonine, self.initial_sonine, not self.spin_cumulants
+            gas.dimension,
+            self.order if self.sonine else 2,
+            not self.sonine,
+            self.initial_sonine,
+            not self.spin_cumulants,
+            self.diffusion,
         )
-        reduced = jnp.where(sound, times, 0.0) * gas.impact_speed / length
-        state, fault = moments_at(
-            scene, reduced, equations, self.solver, rtol * tolerance, self.max_steps
-        )
-        fault |= status.flag(status.UNSUPPORTED, ~sound)
+        return MomentSolver(equations, self.solver, rtol * tolerance, self.max_steps)
+
+    def _curve(
+        self, gas: Gas, times: Float[Array, "times"], state: Moments, fault: Int[Array, ""]
+    ) -> CoolingCurve:
+        """Return the curve of moments in reduced units."""
+        length = gas.path_length
+        fault = fault | status.flag(status.UNSUPPORTED, ~self._is_sound(gas))
         theta = jnp.exp(state.log_temperature)
         # Added last: compiled in float32, exp(nan) can be a number (jaxlib 0.10.1 on a CPU).
         nan_if_failed = jnp.where(fault == status.OK, 0.0, jnp.nan).astype(theta.dtype)
-        temperature, optional = gas.temperature * theta + nan_if_failed, {}
+        temperature = gas.temperature * theta + nan_if_failed
+        optional = {}
         if state.third_sonine is not None:
             optional["third_sonine"] = state.third_sonine + nan_if_failed
         if state.rotation is not None:
             optional["rotational_temperature"] = temperature * state.rotation
-        diffusion = state.diffusion * jnp.sqrt(theta) * length * gas.impact_speed
+        if state.diffusion is not None and state.displacement is not None:
+            diffusion = state.diffusion * jnp.sqrt(theta) * length * gas.impact_speed
+            optional["diffusion"] = diffusion + nan_if_failed
+            optional["displacement"] = state.displacement * length**2 + nan_if_failed
         return CoolingCurve(
             times=times,
             temperature=temperature,
             sonine=state.sonine + nan_if_failed,
             collisions=state.collisions + nan_if_failed,
-            diffusion=diffusion + nan_if_failed,
-            displacement=state.displacement * length**2 + nan_if_failed,
             status=fault,
             **optional,
         )

@@ -6,6 +6,7 @@ alternative explanations of a curve are other numbers of the same program.
 """
 
 import dataclasses
+from collections.abc import Collection
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -13,14 +14,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from jaxgran._utils.tracing import any_traced, as_jax_arrays, fast_compilation, grid_size, pad_to
+from jaxgran._utils.tracing import as_jax_arrays, fast_compilation, grid_size, pad_to
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.elements import Rough, StokesDrag, Walls
 from jaxgran.scene.gas import Gas
+from jaxgran.scene.laws import Viscoelastic, ViscoelasticVariant
 
 LINEARISED = "temperature", "rotational_temperature", "displacement", "collisions"
 """Fields of a curve that are linearised, if the model computes them."""
@@ -36,7 +37,7 @@ STICKING = 1e6
 
 
 class LinearisedCurve(NamedTuple):
-    """A curve and its derivatives; the arrays are those of NumPy unless they are traced.
+    """A curve and its derivatives, arrays of NumPy.
 
     Attributes:
         values: the fields of `COMPUTED` that the model computes, by name.
@@ -50,82 +51,118 @@ class LinearisedCurve(NamedTuple):
     by_time: dict[str, Any]
 
 
-def with_all_elements(gas: Gas, model: AbstractModel) -> Gas:
-    """Return a gas with each element that the model supports; those added have no effect."""
-    missing = {
-        "surface": lambda: Rough(-1.0, friction=STICKING),
-        "container": lambda: Walls(REMOTE_WALLS, restitution=1.0),
-        "drag": lambda: StokesDrag(0.0),
+def with_neutral_elements(gas: Gas, model: AbstractModel) -> Gas:
+    """Return a gas with each element that the model supports; those added have no effect.
+
+    An element of an alternative explanation is then another number of the program that computed the
+    fitted curve, and not another program, which would take seconds to compile.
+    """
+    neutral = {
+        "surface": Rough(-1.0, friction=STICKING),
+        "container": Walls(REMOTE_WALLS, restitution=1.0),
+        "drag": StokesDrag(0.0),
     }
-    added = {
-        name: make()
-        for name, make in missing.items()
+    added: dict[str, Any] = {
+        name: element
+        for name, element in neutral.items()
         if name in model.elements and getattr(gas, name) is None
     }
+    gas = with_variant_law(gas)
     if isinstance(gas.surface, Rough) and gas.surface.friction is None:
         added["surface"] = dataclasses.replace(gas.surface, friction=STICKING)
     return dataclasses.replace(gas, **added)
 
 
+def with_variant_law(gas: Gas) -> Gas:
+    """Return a gas whose viscoelastic law has the floats of alternative laws, without effect."""
+    if type(gas.law) is not Viscoelastic:
+        return gas
+    return dataclasses.replace(gas, law=ViscoelasticVariant.of(gas.law))
+
+
 def linearise(
-    model: AbstractModel, gas: Gas, times: Any, tolerance: float = 1.0
+    model: AbstractModel,
+    gas: Gas,
+    times: Float[np.ndarray, "times"],
+    names: Collection[str],
+    tolerance: float = 1.0,
 ) -> LinearisedCurve:
-    """Return the curve of a gas by a deterministic model, and its derivatives.
+    """Return the curve of a gas by a model without noise, and its derivatives.
 
     Args:
         model: without noise.
         gas: the scene.
         times: t, s, not decreasing, >= 0.
+        names: floats of the gas in which derivatives are taken.
         tolerance: factor of the model's tolerance.
     """
-    size = times.shape[-1]
-    if any_traced(gas, times):
-        values, slopes, by_time = _linearised(
-            model, gas, jnp.asarray(times), jnp.asarray(tolerance)
-        )
-    else:
-        padded = pad_to(np.asarray(times), grid_size(size))
-        computed = _compiled(jax.default_backend())(model, gas, padded, np.asarray(tolerance))
-        values, slopes, by_time = jax.tree.map(
-            lambda x: np.asarray(x)[:size] if x.ndim else np.asarray(x), computed
-        )
-    by_float, begin = {}, 0
-    for name, value in gas.floats.items():
-        end = begin + np.size(value)
-        by_float[name] = {quantity: slope[:, begin:end] for quantity, slope in slopes.items()}
-        begin = end
+    size = times.size
+    padded = pad_to(times, grid_size(size))
+    sizes = {name: np.size(x) for name, x in gas.floats.items() if name in names}
+    directions, delay = _directions(gas, sizes)
+    program = _compiled(jax.default_backend())
+    computed = program(model, gas, padded, np.asarray(tolerance), directions, delay)
+    values, slopes = jax.tree.map(np.asarray, computed)
+    values = {name: x[:size] if x.ndim else x for name, x in values.items()}
+    slopes = {name: x[:, :size].T for name, x in slopes.items()}
+    by_float = {}
+    begin = 1
+    for name, count in sizes.items():
+        part = slice(begin, begin + count)
+        by_float[name] = {quantity: slope[:, part] for quantity, slope in slopes.items()}
+        begin += count
+    by_time = {quantity: slope[:, 0] for quantity, slope in slopes.items()}
     return LinearisedCurve(values, by_float, by_time)
 
 
+def _directions(gas: Gas, sizes: dict[str, int]) -> tuple[Gas, np.ndarray]:
+    """Return tangents of a gas and of a shift of all times, with a first axis (directions,).
+
+    The first direction is that of time, and one follows for each number of some floats. Their
+    number is one of 4, 8, 16, ..., so that few programs are compiled.
+    """
+    count = max(4, 1 << sum(sizes.values()).bit_length())
+    along = jax.tree.map(lambda x: np.zeros((count, *np.shape(x)), jnp.asarray(x).dtype), gas)
+    fields = gas._float_fields
+    begin = 1
+    for name, size in sizes.items():
+        numbers = fields[name].get(along).reshape(count, size)
+        numbers[np.arange(begin, begin + size), np.arange(size)] = 1.0
+        begin += size
+    return along, np.eye(1, count)[0].astype(jnp.result_type(float))
+
+
 def curve_of_program(
-    model: AbstractModel, gas: Gas, times: Float[np.ndarray, "times"]
+    model: AbstractModel, gas: Gas, times: Float[np.ndarray, "times"], displacement: bool = False
 ) -> CoolingCurve:
-    """Return the curve of a gas without <dr^2>, by the program that fits share."""
-    complete = with_all_elements(gas, model)
-    values = dict(linearise(model.for_fits(gas), complete, times).values)
+    """Return the curve of a gas without <dr^2>, by the program that fits share.
+
+    Args:
+        model: without noise.
+        gas: the scene.
+        times: t, s.
+        displacement: use the program of fits that need <dr^2>.
+    """
+    complete = with_neutral_elements(gas, model)
+    simple = model.simplified_for(gas, displacement=displacement)
+    values = dict(linearise(simple, complete, times, ()).values)
     for name in ("displacement", "diffusion"):
         values.pop(name, None)
     return CoolingCurve(**as_jax_arrays({"times": times} | values))
 
 
 def _linearised(
-    model: AbstractModel, gas: Gas, times: Array, tolerance: Array
-) -> tuple[dict[str, Array], dict[str, Array], dict[str, Array]]:
-    """Values, their derivatives in all floats in the order of `Gas.domains`, and in time."""
-    names, values = zip(*gas.floats.items(), strict=True)
-    flat, unravel = ravel_pytree(values)
+    model: AbstractModel, gas: Gas, times: Array, tolerance: Array, gas_along: Gas, delay: Array
+) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Values of a curve, and their derivatives along directions."""
+    curve, along = model.solve_along(gas, times, tolerance, gas_along, delay)
+    values = {name: getattr(curve, name) for name in COMPUTED}
+    slopes = {name: getattr(along, name) for name in LINEARISED}
+    return _known(values), _known(slopes)
 
-    def curve(flat: Array, delay: Array) -> tuple[dict, dict]:
-        changed = gas.replace(**dict(zip(names, unravel(flat), strict=True)))
-        computed = model.curve_in_fit(changed, times + delay, tolerance)
-        fields = {name: getattr(computed, name) for name in COMPUTED}
-        known = {name: value for name, value in fields.items() if value is not None}
-        return {name: known[name] for name in LINEARISED if name in known}, known
 
-    delay = jnp.zeros((), times.dtype)
-    slopes, values = jax.jacfwd(curve, argnums=(0, 1), has_aux=True)(flat, delay)
-    by_float, by_time = ({q: pair[i] for q, pair in slopes.items()} for i in (0, 1))
-    return values, by_float, by_time
+def _known(fields: dict[str, Array | None]) -> dict[str, Array]:
+    return {name: value for name, value in fields.items() if value is not None}
 
 
 @cache

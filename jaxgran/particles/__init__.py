@@ -1,7 +1,7 @@
 """Simulation of particles: spheres in periodic boxes, and velocities without positions (DSMC).
 
-- `run`: a run of any kind of particles, as a function of arrays (jit, vmap, derivatives) or from the
-  host (progress, checkpoints, trajectories, growing arrays, replicas on several devices).
+- `run`: a run of any kind of particles, as a function of arrays (jit, vmap, derivatives) or from
+  the host (progress, checkpoints, trajectories, growing arrays, replicas on several devices).
 - `dynamics`: the interface of a kind of particles. `soft`, `hard` and `dsmc` implement it.
 - `spheres`: the state and the motion that soft and hard spheres share.
 - `start`: initial conditions, random or given by the user.

@@ -176,7 +176,7 @@ class Gas(eqx.Module):
         """Value of every float, by name: arrays of JAX, in fits also of NumPy."""
         return {name: field.get(self) for name, field in self._float_fields.items()}
 
-    def value(self, name: str) -> Float[Array, "..."]:
+    def value(self, name: str) -> Float[Array | np.ndarray, "..."]:
         """Value of the float with this name.
 
         Raises:

@@ -178,6 +178,14 @@ class ReducedLaw(eqx.Module):
         """
         return 1 - self.restitution(normal_speed)
 
+    def loss_powers(
+        self, normal_speed: Float[Array, "..."], count: int
+    ) -> Float[Array, "powers ..."]:
+        """Means of (1 - eps)^k over the impacts at a speed, for k from 0 to `count`, shape (count +
+        1, ...). Here all impacts at a speed have the same eps."""
+        loss = self.loss(normal_speed)
+        return jnp.stack([loss**0 * 1.0, loss, *(loss**k for k in range(2, count + 1))])
+
     def impact_length(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
         """Length scale of the overlap in diameters, ``X = (v^2/alpha)^(2/5)``.
 
@@ -337,6 +345,10 @@ def viscoelastic_restitution(beta: ArrayLike, *, clipped: bool = True) -> Float[
     return jnp.exp(log_viscoelastic_restitution(beta, clipped=clipped))
 
 
+VISCOELASTIC_EXPONENT = 0.2
+"""Exponent of the speed in beta."""
+
+
 class ReducedViscoelastic(ReducedLaw):
     """`Viscoelastic` in reduced units.
 
@@ -363,7 +375,7 @@ class ReducedViscoelastic(ReducedLaw):
         return self.length * normal_speed**0.8
 
     def dissipation(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        return self.beta * normal_speed**0.2
+        return self.beta * normal_speed**VISCOELASTIC_EXPONENT
 
 
 class Viscoelastic(RestitutionLaw):
@@ -437,6 +449,71 @@ class Viscoelastic(RestitutionLaw):
         self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike
     ) -> ReducedViscoelastic:
         return self.of_wall().reduced(diameter=diameter, mass=mass, speed=speed)
+
+
+VARIANT_SPEED = 0.1
+"""Normal speed at which a `ViscoelasticVariant` has the eps of the viscoelastic law, m/s."""
+
+
+class ReducedVariant(ReducedViscoelastic):
+    """`ViscoelasticVariant` in reduced units.
+
+    Attributes:
+        exponent: of the speed in beta.
+        spread: standard deviation of eps before it is clipped.
+    """
+
+    exponent: Float[Array, ""]
+    spread: Float[Array, ""]
+
+    def dissipation(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        return self.beta * normal_speed**self.exponent
+
+    def loss_powers(
+        self, normal_speed: Float[Array, "..."], count: int
+    ) -> Float[Array, "powers ..."]:
+        # Moments of the positive part of a normal distribution, by partial integration.
+        mean = self.loss(normal_speed)
+        has_spread = self.spread > 0
+        width = jnp.where(has_spread, self.spread, 1.0)
+        ratio = mean / width
+        share = jnp.where(has_spread, jax.scipy.stats.norm.cdf(ratio), 1.0)
+        density = jnp.where(has_spread, width * jax.scipy.stats.norm.pdf(ratio), 0.0)
+        square = jnp.where(has_spread, width**2, 0.0)
+        powers = [share, mean * share + density]
+        for k in range(2, count + 1):
+            powers.append(mean * powers[-1] + (k - 1) * square * powers[-2])
+        return jnp.stack([jnp.ones_like(mean), *powers[1:]])
+
+
+class ViscoelasticVariant(Viscoelastic):
+    """Viscoelastic spheres, or spheres of another law: an alternative explanation of a curve.
+
+    ``beta = (3/2) A alpha^(2/5) v_0^(1/5) (v/v_0)^exponent`` at the normal speed v, with v_0 = .1
+    m/s: 1/5 is the viscoelastic law, 0 a constant eps. In each impact eps is that of v plus an
+    independent normal deviate of the standard deviation `spread`; values above 1 become 1.
+    """
+
+    exponent: Float[Array, ""] = eqx.field(converter=float_array, default=VISCOELASTIC_EXPONENT)
+    spread: Float[Array, ""] = eqx.field(converter=float_array, default=0.0)
+
+    domains: ClassVar[dict[str, Domain]] = Viscoelastic.domains | {
+        "exponent": Domain(),
+        "spread": NON_NEGATIVE,
+    }
+
+    @classmethod
+    def of(cls, law: Viscoelastic) -> "ViscoelasticVariant":
+        """Return a variant that is a given law."""
+        return cls(**{f.name: getattr(law, f.name) for f in dataclasses.fields(Viscoelastic)})
+
+    def reduced(
+        self, *, diameter: ArrayLike, mass: ArrayLike, speed: ArrayLike
+    ) -> ReducedViscoelastic:
+        known = super().reduced(diameter=diameter, mass=mass, speed=speed)
+        steeper = (speed / VARIANT_SPEED) ** (self.exponent - VISCOELASTIC_EXPONENT)
+        beta = known.beta * steeper
+        return ReducedVariant(beta, known.length, known.clipped, self.exponent, self.spread)
 
 
 class ConstantRestitution(RestitutionLaw, ReducedLaw):

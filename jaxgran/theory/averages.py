@@ -161,7 +161,11 @@ def averaging_matrix(dimension: int, order: int) -> np.ndarray:
 
 
 def impact_moments(
-    law: ReducedLaw, speed: Float[Array, ""], dimension: int, order: int = 2
+    law: ReducedLaw,
+    speed: Float[Array, ""],
+    dimension: int,
+    order: int = 2,
+    relaxation: bool = True,
 ) -> Float[Array, "rows terms"]:
     """Return averages over the impacts of a Maxwell-Sonine gas, exact in eps(v).
 
@@ -175,6 +179,7 @@ def impact_moments(
         speed: sqrt(T/T_0).
         dimension: d.
         order: of the Sonine expansion: 2 has a_2, 3 also a_3.
+        relaxation: whether the relaxation of velocities, for D, is asked for.
 
     Returns:
         Coefficients of polynomials in a_2 (and a_3), with the columns of `TERMS`. Order 2: mu_2,
@@ -185,9 +190,10 @@ def impact_moments(
     Reference: van Noije & Ernst, Granular Matter 1, 57 (1998), for constant restitution; see the
     references of this module.
     """
-    loss = law.loss(jnp.asarray(NODES, speed.dtype) * speed)
-    powers = jnp.stack([loss**0 * 1.0, loss, *(loss**k for k in range(2, 7))])
-    return jnp.tensordot(jnp.asarray(averaging_matrix(dimension, order), speed.dtype), powers, 2)
+    powers = law.loss_powers(jnp.asarray(NODES, speed.dtype) * speed, NUM_RESTITUTIONS - 1)
+    matrix = averaging_matrix(dimension, order)
+    matrix = matrix if relaxation else matrix[:order]
+    return jnp.tensordot(jnp.asarray(matrix, speed.dtype), powers, 2)
 
 
 def collision_rate(
@@ -204,6 +210,49 @@ def collision_rate(
     """
     factor = 1 - jnp.asarray(sonine) / 16 - jnp.asarray(third_sonine) / 64
     return sphere_surface(dimension) / sqrt(2 * pi) * factor
+
+
+@cache
+def _loss_nodes() -> tuple[Float[np.ndarray, "nodes"], Float[np.ndarray, "nodes"]]:
+    square, weight = scipy.special.roots_genlaguerre(8, 1.0)
+    return np.sqrt(2 * square), 2 * weight
+
+
+def loss_nodes(like: Float[Array, "..."]) -> tuple[Float[Array, "nodes"], Float[Array, "nodes"]]:
+    """Return normal speeds g and weights of ``int_0^inf g^3 exp(-g^2/2) f(g) dg``.
+
+    By Gauss and Laguerre; the arrays have the dtype of `like`.
+    """
+    nodes, weights = _loss_nodes()
+    return jnp.asarray(nodes, like.dtype), jnp.asarray(weights, like.dtype)
+
+
+def loss_moments(
+    law: ReducedLaw, speed: Float[Array, "..."], sonine: ArrayLike = 0.0
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Return the mean and the mean square of the normal energy that an impact takes.
+
+    ``<x^k> = int_0^inf g exp(-g^2/2) (1 + a_2 (g^4 - 6 g^2 + 3)/16) x^k dg`` with the loss ``x = (1
+    - eps^2) g^2``, by 8 nodes of Gauss and Laguerre: relative error below 1e-3 for the laws of this
+    package. The ratio ``r = <x^2>/<x>^2`` is 2 for constant restitution, 2.21 where ``1 - eps^2``
+    grows as v^(1/5).
+
+    Args:
+        law: law of restitution in units of `Gas.impact_speed`.
+        speed: sqrt(T/T_0), any shape.
+        sonine: a_2.
+
+    Returns:
+        <x> and <x^2> per impact of a Maxwellian gas; (m/2) T x is the energy of a pair.
+    """
+    g, weights = loss_nodes(speed)
+    _, one, two, three, four = law.loss_powers(g * speed[..., None], 4)
+    share = 2 * one - two
+    square_of_share = 4 * (two - three) + four
+    square = g**2
+    shape = jnp.asarray(sonine)[..., None] / 16 * (square * (square - 6) + 3)
+    weights = weights * (1 + shape)
+    return jnp.sum(weights * share, -1), jnp.sum(weights * square_of_share * square, -1)
 
 
 _STEEP = 5.0
@@ -320,6 +369,53 @@ def rough_impact_means(
     rate = jnp.sqrt(S / 2)
     slipping = jnp.broadcast_to(eta * uJ, T.shape)
     return [rate * x for x in (of_v, 2 * normal, of_s, of_vs, of_ss, slipping)]
+
+
+def rough_energy_moments(
+    losses: tuple[Float[Array, "..."], Float[Array, "..."]],
+    m: Float[Array, "..."] | None,
+    eta: Float[Array, "..."],
+    inertia: Float[Array, ""],
+    S: Float[Array, "..."],
+    A: Float[Array, "..."],
+    d: int,
+) -> tuple[Float[Array, "2 ..."], Float[Array, "2 2 ..."]]:
+    """Return moments of the energies that an impact of rough spheres adds, over m T and its square.
+
+    The energies are the translational one, ``e = -x/2 + z^2 - z g``, and the rotational one,
+    ``e' = z^2/q - z s``, with the loss x of the normal motion, the tangential velocities g of the
+    centres and s of the surfaces along the slip u = g + s, and the impulse z along it, the smaller
+    one of eta u and Coulomb's limit. Velocities are Gaussian: given u the means of g and s are
+    ``(S/V) u`` and ``(A/V) u``, with V = S + A.
+
+    Args:
+        losses: <x> and <x^2>, see `loss_moments`.
+        m: see `slip_moments`, with ``m = mu (1 + eps)/2 / eta sqrt(S/V)``; None without a limit.
+        eta: coefficient of `Rough`.
+        inertia: q.
+        S: variance of the components of the relative velocity over T, 2 of two Maxwellian spheres.
+        A: that of the sum of both (sigma/2) w, 2 T_rot/(q T).
+        d: dimension.
+
+    Returns:
+        <e> and <e'>; and the matrix <e^2>, <e e'>; <e e'>, <e'^2>.
+    """
+    uJ, JJ, uuJJ, _, J4, uJ3, gguJ, ggJJ = slip_moments(m, d)
+    q, V = inertia, S + A
+    means = -losses[0] / 2 + eta * (eta * V * JJ - S * uJ), eta * (eta / q * V * JJ - A * uJ)
+    fourth = eta**4 * V**2 * J4
+    third = eta**3 * V * uJ3
+    second = eta**2 * S * A * JJ
+    mixed = eta**2 * uuJJ
+    # With a constant eps, x and the slip would depend on each other by the speed alone.
+    normal, kick = -losses[0] / 4, eta**2 * V * ggJJ
+    square = fourth - 2 * S * third + S**2 * mixed + second
+    square = square + losses[1] / 4 + 2 * normal * (kick - eta * S * gguJ)
+    both = fourth / q - (A + S / q) * third + S * A * mixed - second
+    both = both + normal * (kick / q - eta * A * gguJ)
+    square_of_spin = fourth / q**2 - 2 * A / q * third + A**2 * mixed + second
+    squares = jnp.stack([jnp.stack([square, both]), jnp.stack([both, square_of_spin])])
+    return jnp.stack(means), squares
 
 
 ElementBounds = tuple[ArrayLike, ArrayLike, ArrayLike | None, ArrayLike | None]

@@ -53,9 +53,9 @@ class Moments(NamedTuple):
     Attributes:
         log_temperature: ln(T/T_0).
         sonine: a_2.
-        diffusion: D / sqrt(T/T_0), which cooling does not shrink.
-        displacement: <dr^2>.
         collisions: number of collisions per particle.
+        diffusion: D / sqrt(T/T_0), which cooling does not shrink; None where it is not asked for.
+        displacement: <dr^2>; None likewise.
         third_sonine: a_3; None at order 2.
         diffusion_shape: ``<S_1(c^2) v.dr>/d`` over sqrt(T/T_0), S_1 = d/2 + 1 - c^2; None at
             order 2.
@@ -68,20 +68,14 @@ class Moments(NamedTuple):
 
     log_temperature: Float[Array, "..."]
     sonine: Float[Array, "..."]
-    diffusion: Float[Array, "..."]
-    displacement: Float[Array, "..."]
     collisions: Float[Array, "..."]
+    diffusion: Float[Array, "..."] | None = None
+    displacement: Float[Array, "..."] | None = None
     third_sonine: Float[Array, "..."] | None = None
     diffusion_shape: Float[Array, "..."] | None = None
     rotation: Float[Array, "..."] | None = None
     spin_correlation: Float[Array, "..."] | None = None
     spin_kurtosis: Float[Array, "..."] | None = None
-
-    @classmethod
-    def from_array(cls, values: Float[Array, "moments ..."], order: int) -> "Moments":
-        """Return the moments held by the rows of an array."""
-        names = [*cls._fields[: 5 if order == 2 else 7], *cls._fields[7:]]
-        return cls(**dict(zip(names, values, strict=False)))
 
     @property
     def spins(self) -> "Spins | None":
@@ -131,6 +125,27 @@ class Density(NamedTuple):
             gas.packing_fraction if correlations else None,
         )
 
+    def factor(
+        self, law: ReducedLaw, speed: Array, inelasticity: Array, collisions: Array, dimension: int
+    ) -> Float[Array, "*points"]:
+        """Return the factor of the cooling by impacts.
+
+        Args:
+            law: law of restitution in units of the diameter and of `Gas.impact_speed`.
+            speed: sqrt(T/T_0).
+            inelasticity: <1 - eps^2>, weighted by the energy of the normal motion.
+            collisions: per particle since t = 0.
+            dimension: d.
+        """
+        factor = jnp.ones_like(speed)
+        if self.crowding is not None:
+            factor = softness_factor(law, speed, dimension)
+            factor = factor / (1 + self.crowding * law.impact_length(speed))
+        if self.packing_fraction is not None:
+            slowdown = correlation_slowdown(self.packing_fraction, inelasticity, dimension)
+            factor = factor * (1 - slowdown * correlation_build_up(collisions))
+        return factor
+
 
 SceneAndDensity = tuple[ReducedScene, Density]
 """Scene in reduced units, and the effects of its density."""
@@ -152,6 +167,7 @@ class Equations(NamedTuple):
         maxwellian: if True, a_2 stays 0.
         initial_sonine: a_2 at t = 0.
         gaussian_spins: if True, a_11 and a_02 stay 0.
+        spreading: whether D and <dr^2> are asked for.
     """
 
     dimension: int
@@ -159,10 +175,24 @@ class Equations(NamedTuple):
     maxwellian: bool
     initial_sonine: float = 0.0
     gaussian_spins: bool = False
+    spreading: bool = True
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the `Moments`, without those of spins."""
+        names = list(Moments._fields[: 5 if self.spreading else 3])
+        if self.order > 2:
+            names += ["third_sonine"] + (["diffusion_shape"] if self.spreading else [])
+        return names
+
+    def moments(self, values: Float[Array, "moments ..."]) -> Moments:
+        """Return the moments held by the rows of an array."""
+        names = [*self.names, *Moments._fields[7:]]
+        return Moments(**dict(zip(names, values, strict=False)))
 
     def initial(self, scene: SceneAndDensity, like: Array) -> Float[Array, "moments"]:
         """Return the `Moments` at t = 0 as one array, of the dtype of `like`."""
-        start = [jnp.zeros((), like.dtype)] * (5 if self.order == 2 else 7)
+        start = [jnp.zeros((), like.dtype)] * len(self.names)
         start[1] += self.initial_sonine
         if scene[0].surface is not None:
             spins = Spins.gaussian(scene[0].surface.ratio.astype(like.dtype))
@@ -172,7 +202,9 @@ class Equations(NamedTuple):
     def table(self, scene: SceneAndDensity, duration: Array) -> RateTable:
         """Return the averages at all temperatures that the gas reaches in a time."""
         law, d = scene[0].law, self.dimension
-        averages = partial(impact_moments, law, dimension=d, order=self.order)
+        averages = partial(
+            impact_moments, law, dimension=d, order=self.order, relaxation=self.spreading
+        )
         bounds = element_bounds(scene[0], d)
         return RateTable.from_function(averages, duration, d, law.num_nodes, bounds)
 
@@ -189,28 +221,24 @@ class Equations(NamedTuple):
             rates: from `jaxgran.theory.averages.impact_moments` at this temperature.
             scene: the gas.
         """
-        moments, d, order = Moments.from_array(state, self.order), self.dimension, self.order
+        moments = self.moments(state)
+        d = self.dimension
+        order = self.order
         gas, density = scene
         a2, speed = moments.sonine, jnp.exp(moments.log_temperature / 2)
         zero = jnp.zeros_like(speed)
         a3 = zero if moments.third_sonine is None else moments.third_sonine
         # The losses mu_2, mu_4, ..., and the matrix nu_jk row by row.
         values = rates @ jnp.stack([a2**i * a3**j for i, j in zip(*TERMS[order], strict=True)])
-        losses, relaxation = values[:order] * speed, values[order:].reshape(order - 1, -1)
+        losses = values[:order] * speed
         impacts = 2 / d * losses[0]
         a2_rate = 2 * impacts * (1 + a2) - 4 / (d * (d + 2)) * losses[1]
         a3_rate = shape_decay = zero
         if order > 2:
             sixth = 8 / (d * (d + 2) * (d + 4)) * losses[2]
             a3_rate = 3 * a2_rate - 3 * impacts * (1 + 3 * a2 - a3) + sixth
-        cooling = impacts
-        if density.crowding is not None:
-            cooling = cooling * softness_factor(gas.law, speed, d)
-            cooling = cooling / (1 + density.crowding * gas.law.impact_length(speed))
-        if density.packing_fraction is not None:
-            inelasticity = rates[0, 0] * 2 * sqrt(2 * pi) / sphere_surface(d)  # <1 - eps^2>
-            slowdown = correlation_slowdown(density.packing_fraction, inelasticity, d)
-            cooling = cooling * (1 - slowdown * correlation_build_up(moments.collisions))
+        inelasticity = rates[0, 0] * 2 * sqrt(2 * pi) / sphere_surface(d)  # <1 - eps^2>
+        cooling = impacts * density.factor(gas.law, speed, inelasticity, moments.collisions, d)
         relaxing, rotating = zero, []
         if gas.has_elements:
             changes = element_rates(gas, speed, moments.spins, a2, d, self.gaussian_spins)
@@ -225,17 +253,20 @@ class Equations(NamedTuple):
                 rotating = rotating[: 1 if self.gaussian_spins else 3]
         # Of the terms that cool the gas, only impacts change the shape of the velocity
         # distribution.
-        net_growth = cooling / 2 - relaxing
-        diffusing = _diffusion_rates(moments, a3, relaxation, impacts, shape_decay, d)
-        diffusion, *shape = [rate + net_growth * q for rate, q in diffusing]
         rate = [
             -cooling,
             zero if self.maxwellian else a2_rate,
-            diffusion,
-            2 * d * speed * moments.diffusion,
             collision_rate(a2, d, a3) * speed,
         ]
-        third = [] if order == 2 else [a3_rate, *shape]
+        third = [] if order == 2 else [a3_rate]
+        if self.spreading:
+            assert moments.diffusion is not None
+            relaxation = values[order:].reshape(order - 1, -1)
+            diffusing = _diffusion_rates(moments, a3, relaxation, impacts, shape_decay, d)
+            net_growth = cooling / 2 - relaxing
+            diffusion, *shape = [change + net_growth * q for change, q in diffusing]
+            rate += [diffusion, 2 * d * speed * moments.diffusion]
+            third += shape
         return jnp.stack(rate + third + rotating)
 
 
@@ -252,6 +283,7 @@ def _diffusion_rates(
     the cooling rate zeta. The last term is the growth by cooling.
     """
     half, a2, speed = d / 2, moments.sonine, jnp.exp(moments.log_temperature / 2)
+    assert moments.diffusion is not None
     if moments.diffusion_shape is None:
         return [(speed / 2 - relaxation[0, 0] * speed * moments.diffusion, moments.diffusion)]
     q0, q1 = moments.diffusion, moments.diffusion_shape
@@ -326,7 +358,7 @@ TYPICAL_IMPACT = 2 * sqrt(2 / pi)
 """Mean normal speed of impacts, weighted by itself, in units of sqrt(2 T)."""
 
 
-def mean_kick(law: ReducedLaw, speed: Float[Array, ""]) -> Float[Array, ""]:
+def mean_kick(law: ReducedLaw, speed: Float[Array, "*points"]) -> Float[Array, "*points"]:
     """Return (1 + eps)/2 at the typical impact; within 2 % for sliding spheres of ice."""
     return (1 + law.restitution(TYPICAL_IMPACT * speed)) / 2
 
@@ -352,6 +384,23 @@ _STENCIL = np.array(
     ]
 )[:, None]
 """Steps in T and a, and weights of the differences d_TT, d_Ta, d_aa and d_Taa."""
+
+
+def coulomb_limit(
+    surface: ReducedRough, eta: Array, kick: Array, variance: Array
+) -> Float[Array, "..."] | None:
+    """Return m of `slip_moments`, ``mu (1 + eps)/2 / (eta sqrt(V/S))``; None without friction.
+
+    Args:
+        surface: in reduced units.
+        eta: coefficient of `Rough`.
+        kick: (1 + eps)/2, see `mean_kick`.
+        variance: V/S, of a component of the slip over one of the relative velocity.
+    """
+    if surface.friction is None:
+        return None
+    slip = jnp.sqrt(variance) * jnp.maximum(eta, 1e-9)
+    return jnp.minimum(surface.friction * kick / slip, MAX_STICKING)
 
 
 def rough_impact_rates(
@@ -396,10 +445,9 @@ def rough_impact_rates(
     size_T, size_a = 2 * _STEP, 2 * _STEP * (1 + a)
     T1, a1 = 1 + size_T * step_T, a + size_a * step_a
     T, of_spin = (jnp.concatenate([x, jnp.full_like(x, y)]) for x, y in ((T1, 1.0), (a1, a)))
-    S, V, m = 1 + T1, 1 + T1 + a + a1, None
-    if surface.friction is not None:
-        slip = jnp.sqrt(V / S) * jnp.maximum(eta, 1e-9)
-        m = jnp.minimum(surface.friction * kick / slip, MAX_STICKING)
+    S = 1 + T1
+    V = 1 + T1 + a + a1
+    m = coulomb_limit(surface, eta, kick, V / S)
     means = rough_impact_means(T, of_spin, S, V, m, kick, eta, q, d)
     weights = jnp.zeros_like(T1).at[0, 0].set(0.5)
     if not gaussian:
@@ -533,8 +581,8 @@ BUILD_UP_COLLISIONS = 4.0
 
 
 def correlation_slowdown(
-    packing_fraction: Float[Array, ""], inelasticity: Float[Array, ""], dimension: int
-) -> Float[Array, ""]:
+    packing_fraction: Float[Array, ""], inelasticity: Float[Array, "*points"], dimension: int
+) -> Float[Array, "*points"]:
     """Return the share by which velocity correlations, once built up, reduce the cooling rate.
 
     Spheres that have collided move more nearly in parallel than before, and some of them collide
@@ -618,7 +666,9 @@ def softness_coefficient(beta: Float[Array, "..."], dimension: int) -> Float[Arr
     return (dimension - 1) * MEAN_OVERLAP * fitted
 
 
-def softness_factor(law: ReducedLaw, speed: Float[Array, ""], dimension: int) -> Float[Array, ""]:
+def softness_factor(
+    law: ReducedLaw, speed: Float[Array, "*points"], dimension: int
+) -> Float[Array, "*points"]:
     """Return ``1 - c X_T/sigma``, the factor of the cooling rate by the softness of two spheres.
 
     Args:
@@ -775,8 +825,9 @@ def _steady_rates(
 ) -> Float[Array, "variables"]:
     """Rates of change of ln T, a_2, a_3 and the spins where all correlations have built up."""
     zero = jnp.zeros_like(x[:1])
-    moments = jnp.concatenate([x[:2], zero, zero, zero + jnp.inf, x[2:3], zero, x[3:]])
-    rates = impact_moments(scene.law, jnp.exp(x[0] / 2), d, 3)
-    change = Equations(d, 3, maxwellian=False).derivative(moments, rates, (scene, density))
+    moments = jnp.concatenate([x[:2], zero + jnp.inf, x[2:]])
+    equations = Equations(d, 3, maxwellian=False, spreading=False)
+    rates = impact_moments(scene.law, jnp.exp(x[0] / 2), d, 3, relaxation=False)
+    change = equations.derivative(moments, rates, (scene, density))
     # Spins of smooth spheres, beta_t = -1, do not change: they are 0.
-    return jnp.concatenate([change[:2], change[5:6], change[7:] - 1e-30 * x[3:]])
+    return jnp.concatenate([change[:2], change[3:4], change[4:] - 1e-30 * x[3:]])

@@ -4,15 +4,16 @@
 sizes are those of diffrax; the loop around them is written here because it takes half as long to
 compile as `diffrax.diffeqsolve` with its events, adjoints and rounding of times.
 
-`moments_at` has one linear rule for forward and reverse mode: the tangents of those parameters of
-the scene that change are integrated together with the state, in the same steps, so that they are
-the derivatives of the discrete solution. A scene has few parameters in reduced units, and mostly
-one of them changes.
+`MomentSolver.moments` has one linear rule for forward and reverse mode: the tangents of those
+parameters of the scene that change are integrated together with the state, in the same steps, so
+that they are the derivatives of the discrete solution. A scene has few parameters in reduced units,
+and mostly one of them changes. `MomentSolver.moments_along` integrates tangents along given
+directions instead.
 """
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
@@ -158,78 +159,108 @@ def integrate_at(
     return values, t >= last
 
 
-def moments_at(
-    scene: SceneAndDensity,
-    times: Float[Array, "times"],
-    equations: Equations,
-    solver: diffrax.AbstractSolver,
-    rtol: Any,
-    max_steps: int,
-) -> tuple[Moments, Int[Array, ""]]:
-    """Return the moments of a gas at some reduced times, and a status.
+class MomentSolver(NamedTuple):
+    """How the moments of a gas are integrated.
 
-    Args:
-        scene: its floats can be differentiated.
-        times: not decreasing, >= 0.
+    Attributes:
         equations: of the moments.
         solver: of diffrax.
         rtol: relative tolerance; may be traced.
         max_steps: largest number of steps.
-
-    Returns:
-        The moments, each of shape (times,), nan unless the status is ok; and the status.
     """
-    dtype, order = times.dtype, equations.order
-    leaves, structure = jax.tree.flatten(scene)
-    leaves = [jnp.asarray(x, dtype) for x in leaves]
-    _, unravel = ravel_pytree(structure.unflatten(leaves))
 
-    def integrate(
-        derivative: Callable, first: Array, parameters: Array, times: Array
-    ) -> tuple[Array, Int[Array, ""]]:
-        """Return the rows at the given times, shape (times, rows, states), and a status."""
-        known = jnp.all(jnp.isfinite(parameters)) & jnp.all(jnp.isfinite(times))
-        # With nan parameters the state stays constant, so that the solver does not shorten its
-        # steps.
-        times = jnp.where(known, times, jnp.linspace(1.0, 2.0, times.size, dtype=dtype))
-        # The state alone controls the steps: its tangents are then those of the discrete solution.
-        controller = diffrax.PIDController(
-            rtol=rtol, atol=rtol, norm=lambda rows: optx.rms_norm(rows[0][:5])
-        )
-        rows, completed = integrate_at(
-            # s = ln(1 + t): a power law of time takes the same number of steps each decade.
-            lambda s, rows: jnp.where(known, derivative(rows) * jnp.exp(s), 0.0),
-            jnp.where(known, first, 0.0),
-            jnp.log1p(times),
-            solver=solver,
-            controller=controller,
-            max_steps=max_steps,
-        )
-        finite = known & jnp.all(jnp.isfinite(rows))
-        fault = status.flag(status.MAX_STEPS_REACHED, ~completed)
-        fault |= status.flag(status.NOT_FINITE, completed & ~finite)
-        return jnp.where(fault == status.OK, rows, jnp.nan), fault
+    equations: Equations
+    solver: diffrax.AbstractSolver
+    rtol: Any
+    max_steps: int
 
-    @jax.custom_jvp
-    def solve(leaves: list[Array], times: Array) -> tuple[Moments, Int[Array, ""]]:
+    def moments(
+        self, scene: SceneAndDensity, times: Float[Array, "times"]
+    ) -> tuple[Moments, Int[Array, ""]]:
+        """Return the moments of a gas at some reduced times, and a status.
+
+        Args:
+            scene: its floats can be differentiated, forward and reverse.
+            times: not decreasing, >= 0.
+
+        Returns:
+            The moments, each of shape (times,), nan unless the status is ok; and the status.
+        """
+        equations = self.equations
+        dtype = times.dtype
+        leaves, structure = jax.tree.flatten(scene)
+        leaves = [jnp.asarray(x, dtype) for x in leaves]
+
+        @jax.custom_jvp
+        def solve(leaves: list[Array], times: Array) -> tuple[Moments, Int[Array, ""]]:
+            scene = structure.unflatten(leaves)
+            table, start = equations.table(scene, times[-1]), equations.initial(scene, times)
+
+            def derivative(row):
+                return equations.derivative(row, table(row[0]), scene)
+
+            parameters = _ravel(leaves, dtype)
+            rows, fault = self._integrate(jax.vmap(derivative), start[None], parameters, times)
+            return equations.moments(rows[:, 0].T), fault
+
+        @partial(solve.defjvp, symbolic_zeros=True)
+        def solve_jvp(primals, tangents):
+            (leaves, times), (along, times_along) = primals, tangents
+            changing = [np.full(x.size, not _is_zero(x)) for x in along]
+            units = np.eye(sum(x.size for x in along))
+            units = units[np.concatenate([np.zeros(0, bool), *changing])]
+            amounts = _ravel([x for x in along if not _is_zero(x)], dtype)
+            scene = structure.unflatten(leaves)
+            moments, slopes, rates, fault = self._along(scene, times, jnp.asarray(units, dtype))
+            changes = jax.tree.map(lambda j: amounts @ j, slopes)
+            if not _is_zero(times_along):
+                changes = jax.tree.map(lambda m, v: m + v * times_along, changes, rates)
+            no_tangent: Any = np.zeros(fault.shape, jax.dtypes.float0)  # of an integer
+            return (moments, fault), (changes, no_tangent)
+
+        return solve(leaves, times)
+
+    def moments_along(
+        self,
+        scene: SceneAndDensity,
+        times: Float[Array, "times"],
+        scene_along: SceneAndDensity,
+        times_along: Float[Array, "directions times"],
+    ) -> tuple[Moments, Moments, Int[Array, ""]]:
+        """Return the moments of a gas, their derivatives along some directions, and a status.
+
+        The derivatives are integrated beside the moments, in the same steps. It costs less than
+        differentiating `moments` where the directions are fewer than the floats of the scene.
+
+        Args:
+            scene, times: as of `moments`.
+            scene_along: tangents of the floats of the scene, with a first axis (directions,).
+            times_along: tangents of the times.
+
+        Returns:
+            the moments, shape (times,), and their derivatives, shape (directions, times).
+        """
+        dtype = times.dtype
+        leaves = [jnp.asarray(x, dtype) for x in jax.tree.leaves(scene_along)]
+        directions = jnp.concatenate([x.reshape(len(x), -1) for x in leaves], axis=1)
+        moments, slopes, rates, fault = self._along(scene, times, directions)
+        changes = jax.tree.map(lambda m, v: m + v[None] * times_along, slopes, rates)
+        return moments, changes, fault
+
+    def _along(
+        self,
+        scene: SceneAndDensity,
+        times: Float[Array, "times"],
+        directions: Float[Array, "directions parameters"],
+    ) -> tuple[Moments, Moments, Moments, Int[Array, ""]]:
+        """Return moments, their derivatives along directions of the parameters and in time, and a
+        status."""
+        equations = self.equations
+        dtype = times.dtype
+        leaves, structure = jax.tree.flatten(scene)
+        leaves = [jnp.asarray(x, dtype) for x in leaves]
         parameters = _ravel(leaves, dtype)
-        scene = unravel(parameters)
-        table, start = equations.table(scene, times[-1]), equations.initial(scene, times)
-
-        def derivative(row):
-            return equations.derivative(row, table(row[0]), scene)
-
-        rows, fault = integrate(jax.vmap(derivative), start[None], parameters, times)
-        return Moments.from_array(rows[:, 0].T, order), fault
-
-    @partial(solve.defjvp, symbolic_zeros=True)
-    def solve_jvp(primals, tangents):
-        (leaves, times), (along, times_along) = primals, tangents
-        parameters = _ravel(leaves, dtype)
-        changing = [np.full(x.size, not _is_zero(x)) for x in along]
-        units = np.eye(parameters.size)[np.concatenate([np.zeros(0, bool), *changing])]
-        directions = jnp.asarray(units, dtype)
-        amounts = _ravel([x for x in along if not _is_zero(x)], dtype)
+        _, unravel = ravel_pytree(structure.unflatten(leaves))
         table, table_along = jax.linearize(
             lambda parameters: equations.table(unravel(parameters), times[-1]), parameters
         )
@@ -254,17 +285,41 @@ def moments_at(
             lambda parameters: equations.initial(unravel(parameters), times), parameters
         )
         first = jnp.concatenate([start[None], jax.vmap(start_along)(directions)])
-        rows, fault = integrate(rows_derivative, first, parameters, times)
-        states, jacobian = rows[:, 0], rows[:, 1:].T
-        changes = jax.tree.map(lambda j: amounts @ j, Moments.from_array(jacobian, order))
-        if not _is_zero(times_along):
-            rates = jax.vmap(lambda x: derivative(x, table(x[0])[0], parameters))(states)
-            rates = Moments.from_array(rates.T, order)
-            changes = jax.tree.map(lambda m, v: m + v * times_along, changes, rates)
-        no_tangent: Any = np.zeros(fault.shape, jax.dtypes.float0)  # of an integer
-        return (Moments.from_array(states.T, order), fault), (changes, no_tangent)
+        rows, fault = self._integrate(rows_derivative, first, parameters, times)
+        states = rows[:, 0]
+        rates = jax.vmap(lambda x: derivative(x, table(x[0])[0], parameters))(states)
+        slopes = equations.moments(rows[:, 1:].T)
+        return equations.moments(states.T), slopes, equations.moments(rates.T), fault
 
-    return solve(leaves, times)
+    def _integrate(
+        self, derivative: Callable, first: Array, parameters: Array, times: Array
+    ) -> tuple[Array, Int[Array, ""]]:
+        """Return the rows at the given times, shape (times, rows, states), and a status."""
+        dtype = times.dtype
+        controlling = 5 if self.equations.spreading else 3
+        known = jnp.all(jnp.isfinite(parameters)) & jnp.all(jnp.isfinite(times))
+        # With nan parameters the state stays constant, so that the solver does not shorten its
+        # steps.
+        times = jnp.where(known, times, jnp.linspace(1.0, 2.0, times.size, dtype=dtype))
+        # The state alone controls the steps: its tangents are then those of the discrete solution.
+        controller = diffrax.PIDController(
+            rtol=self.rtol,
+            atol=self.rtol,
+            norm=lambda rows: optx.rms_norm(rows[0][:controlling]),
+        )
+        rows, completed = integrate_at(
+            # s = ln(1 + t): a power law of time takes the same number of steps each decade.
+            lambda s, rows: jnp.where(known, derivative(rows) * jnp.exp(s), 0.0),
+            jnp.where(known, first, 0.0),
+            jnp.log1p(times),
+            solver=self.solver,
+            controller=controller,
+            max_steps=self.max_steps,
+        )
+        finite = known & jnp.all(jnp.isfinite(rows))
+        fault = status.flag(status.MAX_STEPS_REACHED, ~completed)
+        fault |= status.flag(status.NOT_FINITE, completed & ~finite)
+        return jnp.where(fault == status.OK, rows, jnp.nan), fault
 
 
 def _ravel(leaves: list[Array], dtype: Any) -> Float[Array, "parameters"]:

@@ -86,8 +86,8 @@ def reads_one_rule_in_both_directions(found):
 def finds_A(found):
     for row in found["rows"]:
         assert len(row["guesses"]) == row["all_simulations"] > 0
-        if row["search"] == "jaxgran.fit":  # 1000 spheres leave A open by some per cent
-            assert abs(row["last_error"][0]) < 0.15
+        if row["search"] == "jaxgran.fit":
+            assert abs(row["last_error"][0]) < 2.5 * row["standard_error"][0] < 0.5
 
 
 C1 = 1.153449
@@ -117,7 +117,7 @@ def claims_hold(found):
 
 OF_IMPACTS, MEMORY = "--only paper_restitution --smoke", "--only paper_velocity_correlation --smoke"
 SCRIPTS = {
-    "fit/sample_posterior": ("--samples 300 --warmup 300", is_the_budgets, "png"),
+    "fit/sample_posterior": ("--samples 300 --warmup 150", is_the_budgets, "png"),
     "fit/drop_tower": ("--runs 1", holds_A, "png"),
     "fit/wrong_physics": ("--runs 3 --rows 'walls, eps'", is_right_where_walls_are_told, ""),
     "fit/fit_head_to_head": ("--smoke --only fit_head_to_head", finds_A, ""),

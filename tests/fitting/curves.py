@@ -49,10 +49,16 @@ def rough_beads(tangential_restitution=0.0):
 
 
 def measured(name):
-    """A curve measured in LAMMPS: the gas, the curve, its A, number of particles and of runs."""
-    curve, header = jaxgran.read_curve(DATA / f"lammps_cooling_{name}.csv")
-    gas = jaxgran.read_gas(header)
-    return gas, curve, float(header["A"]), int(header["N"]), int(header["replicas"])
+    """A curve measured in LAMMPS, with its gas."""
+    return jaxgran.read_measurement(DATA / f"lammps_cooling_{name}.csv")
+
+
+def fitted(gas, curve, free=(A,), **options):
+    """The fit of a curve whose errors are those of the measurement, without the range."""
+    known = {"num_particles": None, "priors": None, "absent": (), "replicas": 1}
+    known |= {name: options.pop(name) for name in known.keys() & options.keys()}
+    measurement = jaxgran.Measurement(gas, curve, errors_measured=True, **known)
+    return jaxgran.fit(measurement, **({"free": free, "quick": True} | options))
 
 
 def deviation(result, gas, name=A):
@@ -61,7 +67,7 @@ def deviation(result, gas, name=A):
     return abs(float(estimate) - float(gas.value(name))) / float(error)
 
 
-def in_range(diagnosis, truth, name=A):
-    """Whether a truth lies in the range that a diagnosis gives."""
-    low, high = diagnosis.ranges[name]
+def in_range(result, truth, name=A):
+    """Whether a truth lies in the range of a fit."""
+    low, high = result.ranges[name]
     return float(low[0]) < float(truth) < float(high[0])

@@ -12,7 +12,7 @@ import scipy.interpolate
 
 import jaxgran
 from tests.beads import glass_beads
-from tests.fitting.curves import A, synthetic
+from tests.fitting.curves import A, fitted, synthetic
 
 
 class Network(jaxgran.RestitutionLaw):
@@ -71,24 +71,23 @@ SERIES = gas_of(jaxgran.RestitutionSeries([-0.2, 0.03], [0.2, 0.4]))
 @pytest.mark.slow
 def test_vectors_are_fitted_by_least_squares_and_by_gradient_descent():
     curve, guess = synthetic(SERIES), SERIES.replace(coefficients=[-0.15, 0.0])
-    options = {"free": ("coefficients",), "progress": False}
-    best = jaxgran.fit(guess, curve, **options)
+    options = {"free": ("coefficients",), "progress": False, "num_particles": 10**7}
+    best = fitted(guess, curve, **options)
     assert best.names == ("coefficients",)
     assert best.element_names == ("coefficients[0]", "coefficients[1]")
     estimate, error = best.value("coefficients")
-    np.testing.assert_allclose(estimate, SERIES.value("coefficients"), atol=1e-4)
+    assert np.all(np.abs(estimate - SERIES.value("coefficients")) < 0.03 * error)
     assert error.shape == (2,) and best.value("coefficients[1]") == (estimate[1], error[1])
     assert "coefficients[1]" in repr(best)
-    result = jaxgran.fit(guess, curve, solver=optax.adam(0.01), **options)
-    # It ends where 50 steps lower chi^2 by less than .01: within a tenth of a standard error.
+    result = fitted(guess, curve, solver=optax.adam(0.01), **options)
     np.testing.assert_allclose(result.estimate, best.estimate, atol=0.5 * best.standard_error.max())
     assert result.converged and result.chi2 < 1
-    trace = result.minima.trace
-    assert trace.loss.shape == (int(result.iterations),)
-    assert trace.parameters.shape == (int(result.iterations), 2)
+    trace = result.trace
+    assert trace.loss.shape == (result.iterations,)
+    assert trace.parameters.shape == (result.iterations, 2)
     assert trace.reason in repr(result)
-    short = jaxgran.fit(guess, curve, solver=optax.adam(0.01), max_steps=3, **options)
-    assert not short.converged and "3, was reached" in short.minima.trace.reason
+    short = fitted(guess, curve, solver=optax.adam(0.01), max_steps=3, **options)
+    assert not short.converged and "3, was reached" in short.trace.reason
 
 
 @pytest.mark.slow  # compiles a search
@@ -96,9 +95,9 @@ def test_a_descent_that_diverges_says_what_to_do():
     curve, guess = synthetic(SERIES), SERIES.replace(coefficients=[-0.18, 0.0])
     options = {"free": ("coefficients",), "solver": optax.sgd(1.0), "progress": False}
     with pytest.raises(RuntimeError, match=r"at step 1.*Lower the learning rate.*clip_by_global"):
-        jaxgran.fit(guess, curve, **options)
-    result = jaxgran.fit(guess, curve, throw=False, **options)
-    assert not result.converged and "diverges" in result.minima.trace.reason
+        fitted(guess, curve, **options)
+    result = fitted(guess, curve, throw=False, **options)
+    assert not result.converged and "diverges" in result.trace.reason
     np.testing.assert_allclose(result.estimate, [-0.18, 0.0], atol=1e-12)
 
 
@@ -132,60 +131,35 @@ def test_spline():
 def test_a_law_is_learnt_from_a_curve(caplog):
     true = glass_beads(0.15)
     curve = synthetic(true)
-    result = jaxgran.fit(spline_gas(curve), curve, free="law")
+    result = fitted(spline_gas(curve), curve, free="law", num_particles=10**7)
     band = jaxgran.restitution_band(result)
     eps = true.restitution(band.speeds)
     assert np.all((band.low < eps) & (eps < band.high))
     assert np.all((band.high - band.low)[2:-2] < 0.04)
-    assert {"measurement", "smoothness", "model"} == {*result.error_budget}
-    assert result.undetermined() == ()
-    chi2, p, fitted = band.compare(true.replace(dissipative_constant=1e-7), A)
+    assert {"measurement", "smoothness", "model"} <= {*result.error_budget}
+    assert result.undetermined == ()
+    chi2, p, compared = band.compare(true.replace(dissipative_constant=1e-7), A)
     assert chi2 < 0.3 and p > 0.5  # the curve has no noise
-    np.testing.assert_allclose(fitted.value(A), true.value(A), rtol=0.02)
+    np.testing.assert_allclose(compared.value(A), true.value(A), rtol=0.02)
     chi2, p, _ = band.compare(gas_of(jaxgran.ConstantRestitution(0.9)), "coefficient")
     assert chi2 > 10 and p < 1e-6
     wide = jaxgran.RestitutionSpline(np.geomspace(1e-4, 1.0, 8))
     words = r"knots at 0.0001, .* outside the impact speeds 0.0095"
     with jax.log_compiles(), pytest.warns(UserWarning, match=words):
-        jaxgran.fit(gas_of(wide), curve, free="law")
+        fitted(gas_of(wide), curve, free="law", num_particles=10**7)
     assert "Compiling" not in caplog.text  # other knots share the programs
     with pytest.raises(ValueError, match="no number of the law was free"):
-        jaxgran.restitution_band(jaxgran.fit(true, curve, free=("temperature",)))
+        jaxgran.restitution_band(fitted(true, curve, free=("temperature",)))
 
 
 @pytest.mark.slow  # compiles derivatives of runs
 def test_a_law_is_learnt_through_simulations():
     curve = synthetic(glass_beads(0.15), num_points=12, relative_error=0.02)
     learner, model = spline_gas(curve, 4), jaxgran.DSMC(500, replicas=2)
-    options = {"model": model, "free": "law", "progress": False}
-    result = jaxgran.fit(learner, curve, solver=optax.adam(0.1), max_steps=30, **options)
-    assert result.minima.trace.loss[-1] < 0.05 * result.minima.trace.loss[0]
+    options = {"model": model, "free": "law", "progress": False, "num_particles": 10_000}
+    result = fitted(learner, curve, solver=optax.adam(0.1), max_steps=30, **options)
+    assert result.trace.loss[-1] < 0.05 * result.trace.loss[0]
     band = jaxgran.restitution_band(result)
     eps = glass_beads(0.15).restitution(band.speeds)
     assert np.all(np.abs(np.log(np.log(band.restitution) / np.log(eps))) < 0.3)
     assert np.all(result.standard_error > 0)
-
-
-@pytest.mark.slow  # compiles the search
-def test_many_gases_and_curves_of_different_lengths_are_fitted_at_once():
-    # Points with an error of 0 have no weight: a short curve is filled up with them.
-    long, short = (synthetic(SERIES, num_points=n) for n in (20, 12))
-    T, last = short.temperature, short.times[-1]
-    pad = jaxgran.CoolingCurve(
-        jnp.append(short.times, last * jnp.linspace(1.1, 2, 8)),
-        jnp.append(T, jnp.full(8, T[-1])),
-        temperature_error=jnp.append(short.temperature_error, jnp.zeros(8)),
-    )
-    batch = jax.tree.map(lambda *x: jnp.stack(x), long, pad, long)
-    guess, packings = SERIES.replace(coefficients=[-0.15, 0.0]), jnp.array([0.05, 0.05, 0.055])
-
-    def fitted(curve, phi):
-        gas = guess.replace(packing_fraction=phi)
-        result = jaxgran.fit(gas, curve, free=("coefficients",))
-        return result.estimate, result.chi2
-
-    estimates, chi2 = jax.jit(jax.vmap(fitted))(batch, packings)
-    np.testing.assert_allclose(estimates[:2], [SERIES.value("coefficients")] * 2, atol=1e-5)
-    np.testing.assert_allclose(chi2[:2], 0.0, atol=1e-4)  # without noise
-    single = [fitted(long, phi)[0] for phi in packings[1:]]
-    np.testing.assert_allclose(estimates[::2], jnp.stack(single), rtol=1e-6)

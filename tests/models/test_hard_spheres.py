@@ -161,7 +161,8 @@ def test_jit_flags_the_start_of_another_gas_and_what_it_cannot_grow():
 
 @pytest.mark.slow
 def test_lammps_curve():
-    gas, curve, _ = of_lammps("dilute")
+    measurement = of_lammps("dilute")
+    gas, curve = measurement.gas, measurement.curve
     ours = jaxgran.cool(gas, curve.times, model=HardSpheres(1000, replicas=4))
     # LAMMPS resolves contacts, whose softness slows the cooling by 0.5 %.
     soft, hard = (

@@ -25,8 +25,10 @@ def errors(choice):
     [("dense", jaxgran.SoftSpheres, 0.76), ("dilute", jaxgran.KineticTheory, 0.987)],
 )
 def test_measured_curves(name, model, fitted):
-    gas, curve, a_true, n, replicas = measured(name)
-    options = {"num_particles": n, "replicas": replicas}
+    measurement = measured(name)
+    gas, curve = measurement.gas, measurement.curve
+    a_true = float(dict(measurement.header)["A"])
+    options = {"num_particles": measurement.num_particles, "replicas": measurement.replicas}
     # Nothing is known at first but the A that kinetic theory fits, 24 % low on the dense curve.
     first = gas.replace(dissipative_constant=fitted * a_true)
     choice = jaxgran.choose_model(first, curve.times, **options)

@@ -1,4 +1,5 @@
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -7,9 +8,10 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jaxgran
+from jaxgran.data.header import gas_of_header
 from jaxgran.theory.averages import impact_moments
 from tests.beads import SI, glass_beads, hard_gas, theory_curve
-from tests.data.test_faults_csv import gas_of
+from tests.data.test_faults_csv import gas_of, header_of
 
 TAUS = np.geomspace(1.0, 300.0, 8)
 
@@ -163,8 +165,8 @@ def test_a_header_may_say_that_there_is_nothing_of_it():
 
 
 def test_unknown_header_keys_are_told():
-    with pytest.warns(UserWarning, match="ignoring unknown header keys: mu.*are eta.*friction"):
-        gas_of(**{"mu": "0.5", "A comment of some words": "x"})
+    _, (question,) = gas_of_header(header_of(**{"mu": "0.5", "A comment of some words": "x"}))
+    assert re.match("ignoring unknown header keys: mu. Known keys are eta.*friction", question)
 
 
 def test_a_box_that_does_not_hold_other_spheres_is_refused_in_a_choice():

@@ -1,3 +1,4 @@
+import dataclasses
 from functools import partial
 
 import jax
@@ -7,6 +8,7 @@ import pytest
 
 import jaxgran
 from jaxgran import viscoelastic_restitution
+from jaxgran.scene.laws import ViscoelasticVariant
 from tests.beads import SI, glass_beads, hard_gas
 from tests.scene.test_contact import REFERENCE, SLOPES
 
@@ -103,3 +105,21 @@ def test_restitution_is_a_fraction_that_falls(clipped):
     beta = jnp.append(0.0, jnp.geomspace(1e-9, 1e6, 2000))
     eps = viscoelastic_restitution(beta, clipped=clipped)
     assert jnp.all((eps > 0) & (eps <= 1)) and jnp.all(jnp.diff(eps) < 0)
+
+
+def test_a_variant_is_the_viscoelastic_law_or_one_whose_eps_scatters():
+    gas = glass_beads(0.3)
+    speeds = jnp.array([0.02, 0.5, 2.0])
+    same = dataclasses.replace(gas, law=ViscoelasticVariant.of(gas.law))
+    powers = same.reduced_law.loss_powers(speeds, 6)
+    np.testing.assert_allclose(powers, gas.reduced_law.loss_powers(speeds, 6), rtol=1e-12)
+    constant = same.replace(exponent=0.0).restitution(np.array([0.01, 1.0]))
+    np.testing.assert_allclose(constant, gas.restitution(0.1), rtol=1e-12)
+    # Means over normal deviates of eps, of which those above 1 become 1.
+    law = same.replace(spread=0.08).reduced_law
+    deviates, weights = np.polynomial.hermite_e.hermegauss(180)
+    eps = np.asarray(law.restitution(speeds))[:, None] + 0.08 * deviates
+    for k in range(7):
+        mean = np.maximum(1 - eps, 0.0) ** k @ weights / weights.sum()
+        rtol = 5e-3 if k == 1 else 1e-3  # the kink at eps = 1
+        np.testing.assert_allclose(law.loss_powers(speeds, 6)[k], mean, rtol=rtol)

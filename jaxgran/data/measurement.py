@@ -1,0 +1,355 @@
+"""A measurement: what was measured, the gas that it was measured of, and what is known of both."""
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxgran._utils.formatting import text_table
+from jaxgran._utils.validation import (
+    NON_NEGATIVE,
+    POSITIVE,
+    Domain,
+    check_bool,
+    checked_float,
+    checked_int,
+    float_array,
+)
+from jaxgran.data import files
+from jaxgran.data.curve import QUANTITIES, CoolingCurve
+from jaxgran.data.curve_file import CSV_FILE, read_data
+from jaxgran.data.drop_test import DropTest
+from jaxgran.data.header import (
+    ABSENT,
+    ANY_GAS,
+    absent_of_header,
+    checked_header,
+    gas_of_header,
+    guesses_of_header,
+    header_choice,
+    priors_of_header,
+)
+from jaxgran.scene.gas import Gas
+from jaxgran.scene.parameters import REQUIRED
+
+START_TIME = "t0"
+"""Name of the time, on the clock of the measurement, at which the gas had its temperature T_0 and
+began to cool: the only parameter of a fit that is not a parameter of a gas."""
+
+DENSITY = "density"
+"""Name of a prior that is not of a parameter of a gas: the mass over the volume of a sphere."""
+
+SMALLEST = 1e-30
+"""Smallest value of a measurement that is allowed, SI."""
+
+LARGEST = 1e30
+"""Largest value of a measurement that is allowed, SI."""
+
+MIN_ERROR = 1e-12
+"""Smallest allowed relative error of a measurement."""
+
+Priors = dict[str, tuple[Float[Array, "..."], Float[Array, "..."]]]
+"""Known values and their standard errors, SI, by the name of a parameter of a gas, or "density",
+which lets the mass vary, or "t0", the time at which the gas began to cool. Each prior is Gaussian
+in the unconstrained scale (the logarithm of a positive parameter)."""
+
+
+class Measurement(eqx.Module):
+    """A measured curve or drop test, with the gas and all that is known of both.
+
+    Args:
+        gas: the scene. Its values of parameters that a fit estimates are not used where the data
+            give a guess (A, T_0, a constant restitution); the others are the guess.
+        data: the measured `CoolingCurve`, or a `DropTest` of spheres of this gas. Without errors of
+            T, a relative error that is the same at all times is estimated from the scatter.
+        num_particles: N of the measured gas, if known. It gives the errors due to the randomness of
+            single collisions and due to a flow that grows in the box, and corrects a model without
+            noise for the faster cooling of few particles (a particle model needs as many particles
+            as were measured).
+        replicas: number of runs over which the curve is a mean.
+        priors: known values and standard errors, SI, by name, as
+            ``{"packing_fraction": (0.05, 0.002)}``: of parameters of the gas, of "density", which
+            lets the mass vary, or of "t0". Each is Gaussian in the unconstrained scale (the
+            logarithm of a positive parameter).
+        absent: effects that are known to be absent, of "walls", "roughness", "drag" and "friction":
+            a fit does not consider them as explanations of the curve.
+        tracked: number of grains that T is the mean of, if it is less than N: T then has a sampling
+            error in addition. None if T is that of all grains.
+        ensemble_start: True if T_0 of the gas is that of an ensemble from which the velocities were
+            drawn; False if it is that of the run itself.
+        calibration_error: relative standard error of the scale of T, common to all times.
+        errors_measured: True if the errors of the data are those of the measurement. Errors of T of
+            one run that equal ``sqrt(2/(d N)) T`` are otherwise taken for the fluctuation of
+            independent samples and left out, since the fluctuations of N grains are known.
+        rounding: last digit of a field of the curve as it was written, SI, one number or one for
+            each time, as ``{"temperature": 1e-6}``; {} if all are exact.
+        guesses: parameters of the gas whose values are guesses, which a fit must estimate.
+        header: header of the file from which it was read, pairs of a key and a text, in SI.
+
+    Raises:
+        ValueError: naming the wrong field, what was given, what is allowed.
+
+    >>> measured = jaxgran.CoolingCurve([0.1, 1.0, 3.0], [8e-3, 2e-3, 5e-4])
+    >>> jaxgran.Measurement(gas, measured, num_particles=250).replicas
+    1
+    """
+
+    gas: Gas
+    data: CoolingCurve | DropTest
+    num_particles: int | None = eqx.field(static=True, default=None)
+    replicas: int = eqx.field(static=True, default=1)
+    priors: Priors = eqx.field(default_factory=dict)
+    absent: tuple[str, ...] = eqx.field(static=True, default=())
+    tracked: int | None = eqx.field(static=True, default=None)
+    ensemble_start: bool = eqx.field(static=True, default=False)
+    calibration_error: float = eqx.field(static=True, default=0.0)
+    errors_measured: bool = eqx.field(static=True, default=False)
+    rounding: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
+    guesses: tuple[str, ...] = eqx.field(static=True, default=())
+    header: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
+
+    def __init__(
+        self,
+        gas: Gas,
+        data: CoolingCurve | DropTest,
+        num_particles: int | None = None,
+        replicas: int = 1,
+        priors: dict[str, tuple[Any, Any]] | None = None,
+        absent: tuple[str, ...] = (),
+        *,
+        tracked: int | None = None,
+        ensemble_start: bool = False,
+        calibration_error: float = 0.0,
+        errors_measured: bool = False,
+        rounding: dict[str, Any] | None = None,
+        guesses: tuple[str, ...] = (),
+        header: tuple[tuple[str, str], ...] = (),
+    ):
+        if not isinstance(gas, Gas):
+            raise ValueError(f"gas must be a jaxgran.Gas, got {type(gas).__name__}")
+        gas.check_single()
+        if isinstance(data, CoolingCurve):
+            data.check()
+            _check_magnitudes(data)
+        elif not isinstance(data, DropTest):
+            raise ValueError(
+                f"data must be a jaxgran.CoolingCurve or a jaxgran.DropTest, got {data!r:.60}. "
+                "Make a curve of arrays by jaxgran.CoolingCurve(t, T)"
+            )
+        if num_particles is not None:
+            num_particles = checked_int("num_particles", num_particles, 1)
+        self.gas = gas
+        self.data = data
+        self.num_particles = num_particles
+        self.replicas = checked_int("replicas", replicas, 1)
+        self.priors = checked_priors(gas, {} if priors is None else priors)
+        self.absent = checked_absent(absent)
+        self.tracked = None if tracked is None else checked_int("tracked", tracked, 1)
+        if tracked is not None and num_particles is not None and tracked > num_particles:
+            raise ValueError(f"tracked must be at most N = {num_particles}, got {tracked}")
+        check_bool(ensemble_start=ensemble_start, errors_measured=errors_measured)
+        self.ensemble_start = ensemble_start
+        self.calibration_error = checked_float(
+            "calibration_error", calibration_error, NON_NEGATIVE, "0.02 stands for 2 %."
+        )
+        self.errors_measured = errors_measured
+        self.rounding = checked_rounding({} if rounding is None else rounding)
+        self.guesses = tuple(guesses)
+        self.header = tuple(header)
+
+    @property
+    def curve(self) -> CoolingCurve:
+        """The measured curve.
+
+        Raises:
+            ValueError: for a drop test.
+        """
+        if isinstance(self.data, DropTest):
+            raise ValueError("this measurement is a drop test, without a curve: use its data")
+        return self.data
+
+    def __repr__(self) -> str:
+        N = "unknown" if self.num_particles is None else str(self.num_particles)
+        rows = [
+            ("gas", repr(self.gas).partition("\n")[0]),
+            ("data", repr(self.data).partition("\n")[0]),
+            ("N, runs", f"{N}, {self.replicas}"),
+            ("known with an error", ", ".join(self.priors) or "nothing"),
+            ("known to be absent", ", ".join(self.absent) or "nothing"),
+        ]
+        return text_table("Measurement", rows)
+
+
+def read_measurement(
+    path: str | Path, header: dict[str, Any] | None = None, *, gas: Gas | None = None
+) -> Measurement:
+    """Read a measured cooling curve or a drop test, with the gas that the header describes.
+
+    A CSV file has header lines ``# key: value``, a line with the names of the columns, and rows of
+    numbers::
+
+        # eta: 0.05
+        # diameter: 2 mm
+        t,T,T_err,msd
+        0.0,1.0e-2,0,0
+        7.8e-3,9.79e-3,8.0e-6,1.7e-6
+
+    Args:
+        path: the file. A CSV file of a curve has the columns t (s) and T (m^2/s^2) and, where
+            measured, T_err (m^2/s^2), T_rot, T_rot_err, msd and msd_err (m^2), in any order. In
+            place of T there may be mean_speed, vx2, v2_xy or energy
+            (`jaxgran.data.curve_file.TEMPERATURE_COLUMNS`), with errors under the same name and
+            _err. A drop test has the columns v (m/s), eps and eps_err. Tracks of particles have
+            the columns id,t,x,y and, where measured, z (`jaxgran.data.tracks.curve_of_tracks`).
+            Units may stand after a name or a value, as in ``t (ms)`` and ``# diameter: 2 mm``;
+            header keys length_unit, time_unit and speed_unit, which holds for T squared, give
+            those of all other columns and of diameter, T0, A and the like; other numbers are in
+            SI. Commas, semicolons, tabs or blanks separate the columns; between semicolons
+            numbers may have decimal commas.
+            Trajectories with velocities (GSD, extended XYZ, LAMMPS dump) and npz files that
+            `write_curve` writes are read, too.
+        header: entries that count as those of the file, before anything is read; they replace
+            entries with the same key. Keys are those of `jaxgran.data.header.gas_of_header` and
+            `priors_of_header`, N, replicas, absent, tracked, T0_of ("run" or "ensemble"),
+            T_scale_err, errors ("measured"), which stand for the arguments of `Measurement`, onto
+            (of a drop test: "sphere" or "plate"), and those of tracks.
+        gas: the gas in place of that of the header, such as that of a curve for a drop test.
+
+    Returns:
+        `Measurement`. Unusual values, and columns that contradict the header, cause warnings,
+        which ask a question.
+
+    Raises:
+        ValueError: naming the file, what is wrong, in which line, and what to do.
+
+    >>> known = {"eta": 0.05, "diameter": "2 mm", "density": 2387, "Y": 5e7, "nu": 0.22, "T0": 0.01}
+    >>> jaxgran.write_curve("mine.csv", curve, known, overwrite=True)
+    >>> measurement = jaxgran.read_measurement("mine.csv", {"N": 250})
+    >>> measurement.curve.times.shape, measurement.num_particles
+    ((4,), 250)
+    """
+    path = files.checked_path(path, CSV_FILE)
+    given = {} if header is None else checked_header(header)
+    with files.name_in_errors(path):
+        content = read_data(path, given)
+        entries = content.header
+        questions = content.questions
+        if isinstance(content.data, DropTest) and gas is None:
+            entries = ANY_GAS | entries
+            if missing := [key for key in REQUIRED if key not in entries]:
+                raise ValueError(
+                    f"the header of this drop test lacks {', '.join(missing)}: add them, or give "
+                    "the gas of a curve, by gas=... or by jaxgran fit CURVE.csv --drop-test"
+                )
+        if gas is None:
+            gas, more = gas_of_header(entries)
+            questions += more
+        measurement = Measurement(
+            gas,
+            content.data,
+            num_particles=files.header_count(entries, "N"),
+            replicas=files.header_count(entries, "replicas") or 1,
+            priors=priors_of_header(entries),
+            absent=absent_of_header(entries),
+            tracked=files.header_count(entries, "tracked"),
+            ensemble_start=header_choice(entries, "T0_of", ("run", "ensemble")) == "ensemble",
+            calibration_error=files.header_number({"T_scale_err": "0"} | entries, "T_scale_err"),
+            errors_measured=header_choice(entries, "errors", ("any", "measured")) == "measured",
+            rounding=content.rounding,
+            guesses=guesses_of_header(entries),
+            header=tuple(entries.items()),
+        )
+    for question in questions:
+        warnings.warn(f"{path}: {question}", stacklevel=2)
+    return measurement
+
+
+def checked_rounding(rounding: Any) -> dict[str, Array]:
+    """Return last digits of the fields of a curve as arrays, or raise ValueError."""
+    fields = ("temperature", "rotational_temperature")
+    if not isinstance(rounding, dict) or not set(rounding) <= set(fields):
+        raise ValueError(
+            f"rounding must be a dictionary of {' and '.join(fields)}, as "
+            f"{{'temperature': 1e-6}}, got {rounding!r:.60}"
+        )
+    converted = {}
+    for name, digit in rounding.items():
+        converted[name] = float_array(digit, f"rounding of {name}")
+        NON_NEGATIVE.check(f"rounding of {name}", converted[name], "Give the last digit, SI.")
+    return converted
+
+
+def checked_absent(absent: Any) -> tuple[str, ...]:
+    """Return the names of effects that a user declares absent, or raise ValueError."""
+    if isinstance(absent, str) or not set(absent) <= set(ABSENT):
+        raise ValueError(f"absent must be a tuple of {', '.join(ABSENT)}, got {absent!r}")
+    return tuple(absent)
+
+
+def checked_priors(gas: Gas, priors: Any) -> Priors:
+    """Check and convert the priors that a user gave.
+
+    Raises:
+        ValueError: for an unknown name, a value outside its range or an error that is not positive.
+    """
+    if not isinstance(priors, dict):
+        raise ValueError(
+            f"priors must be a dictionary of names, as {{'packing_fraction': (0.05, 0.002)}}, "
+            f"got {priors!r:.60}"
+        )
+    converted = {}
+    for name, pair in priors.items():
+        if name not in (DENSITY, START_TIME) and name not in gas.domains:
+            raise ValueError(
+                f"priors: no float {name!r} in this gas; it has {', '.join(gas.domains)}, and "
+                f"{DENSITY} and {START_TIME}"
+            )
+        if not isinstance(pair, tuple | list) or len(pair) != 2:
+            raise ValueError(
+                f"priors: {name} needs (value, standard error), as (0.05, 0.002), got {pair!r:.60}"
+            )
+        value, error = pair
+        domain = prior_domain(gas, name)
+        domain.check(f"priors: {name}", value, "Give the known value, in SI units.")
+        advice = "Leave out values that are known exactly."
+        POSITIVE.check(f"priors: standard error of {name}", error, advice)
+        if not np.all(np.isfinite(domain.to_free(np.asarray(value, float)))):
+            raise ValueError(
+                f"priors: {name} = {value} lies on the end of its range {domain}: give a value "
+                "inside the range"
+            )
+        converted[name] = (float_array(value), float_array(error))
+    return converted
+
+
+def prior_domain(gas: Gas, name: str) -> Domain:
+    """Return the allowed values of a parameter that may have a prior."""
+    if name == START_TIME:
+        return Domain()
+    return POSITIVE if name == DENSITY else gas.domains[name]
+
+
+def _check_magnitudes(curve: CoolingCurve) -> None:
+    """Raise ValueError for values that cannot be measured, mostly typing or unit errors."""
+    for name, quantity in QUANTITIES.items():
+        values = getattr(curve, name) if quantity.measured else None
+        if values is None:
+            continue
+        values = np.asarray(values)
+        least = SMALLEST
+        if name.endswith("_error"):
+            of = getattr(curve, name.removesuffix("_error"))
+            if of is None:
+                raise ValueError(f"the curve has {name} without the values. Leave it out as well.")
+            least = MIN_ERROR * np.asarray(of)
+        wrong = (values > 0) & ((values < least) | (values > LARGEST))
+        if np.any(wrong):
+            i = int(np.argmax(wrong))
+            raise ValueError(
+                f"point {i}: {quantity.column} is {values[i]:g}, which cannot be measured. Allowed "
+                f"are {SMALLEST:g} to {LARGEST:g} in SI units, and errors above {MIN_ERROR:g} of "
+                "the value: correct or remove the point"
+            )

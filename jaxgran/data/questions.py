@@ -1,0 +1,224 @@
+"""Questions about unusual values of a measured curve and its header, most of them by their units.
+
+Each question names the value, what is usual, and the factor that would make it usual. The reader
+turns it into a warning; the values are used as they are.
+"""
+
+from collections.abc import Iterator
+from math import sqrt
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array
+
+from jaxgran.data import files
+from jaxgran.data.curve import QUANTITIES, CoolingCurve
+from jaxgran.data.tables import UNITS, unit_in
+from jaxgran.scene.gas import Gas
+from jaxgran.scene.parameters import REQUIRED
+
+USUAL_RANGES = {
+    "diameter": (1e-7, 0.1),
+    "density": (10.0, 2.5e4),
+    "Y": (1e3, 1e13),
+    "T0": (1e-12, 900.0),  # a thermal speed of 30 m/s
+    "T_rot_0": (0.0, 900.0),
+    "A": (0.0, 0.1),
+    "container_side": (1e-6, 100.0),
+    "gamma": (0.0, 1e4),
+    "drive_strength": (0.0, 1e4),
+    "t": (0.0, 1e7),
+    "T": (0.0, 900.0),
+    "msd": (0.0, 1e4),
+    "T_rot": (0.0, 900.0),
+}
+"""Smallest and largest usual value of header keys and columns in granular gases."""
+
+OTHER_UNITS = {
+    "m": ("mm", "cm", "um"),
+    "m^2": ("mm^2", "cm^2", "um^2"),
+    "s": ("ms", "us", "min"),
+    "1/s": ("1/ms", "1/min"),
+    "m^2/s^2": ("mm^2/s^2", "cm^2/s^2"),
+    "m^2/s^3": ("mm^2/s^3", "cm^2/s^3"),
+    "kg/m^3": ("g/cm^3",),
+    "Pa": ("GPa", "MPa", "kPa"),
+}
+"""Units in which values are often given, by SI unit."""
+
+BOLTZMANN = 1.380649e-23
+
+MAX_RATIO = 1.3
+"""Ratio of T at t = 0 to T0, or of T0 to it, above which a question is asked."""
+
+MAX_LATENESS = 0.3
+"""Delay of the clock over the time in which T halves, above which a question is asked."""
+
+USUAL_LOSS = (1e-3, 3.0)
+"""Usual loss ``d (-dT/dt)/(nu_0 T)`` at first: 1 - eps^2 of smooth spheres in a box."""
+
+MAX_ERROR_RATIO = 10.0
+"""Ratio of T_err to the scatter of N particles, or its inverse, above which a question is asked."""
+
+
+def _is_usual(name: str, value: float) -> bool:
+    low, high = USUAL_RANGES.get(name, (-np.inf, np.inf))
+    return low <= value <= high
+
+
+def ask_about_header(values: dict[str, float]) -> Iterator[str]:
+    """Yield questions about unusual values of header keys, in SI."""
+    for key, value in values.items():
+        if not _is_usual(key, value):
+            yield _unit_question(key, value, f"{key}: ")
+        error = values.get(f"{key}_err", 0.0)
+        if key in USUAL_RANGES and error > value > 0:
+            yield (
+                f"{key}_err is {error:.6g} {UNITS[key]}, more than {key}, {value:.6g}: a number "
+                f"without a unit has that of {key}. Is it in {UNITS[key]}? Then write it behind"
+            )
+
+
+def _unit_question(name: str, value: float, line: str) -> str:
+    low, high = USUAL_RANGES[name]
+    base = UNITS[name]
+    question = "check its unit"
+    for unit in OTHER_UNITS[base]:
+        in_si = unit_in(unit, base) * value
+        if _is_usual(name, in_si):
+            rewritten = f"{line}{in_si:.6g}, or {line}{value:g} {unit}"
+            rewritten = rewritten if line else f"{name} ({unit}) as the name of the column"
+            question = f"is it in {unit}? Then write {rewritten}"
+            break
+    return f"{name} is {value:.6g} {base}, and usual is {low:g} to {high:g}: {question}"
+
+
+def ask_about_columns(
+    curve: CoolingCurve,
+    header: dict[str, str],
+    gas: Gas | None,
+    rounding: dict[str, np.ndarray],
+) -> Iterator[str]:
+    """Yield questions about unusual values of columns, and columns that contradict the header.
+
+    Args:
+        curve: the columns, in SI.
+        header: in SI.
+        gas: of the header, if it describes one.
+        rounding: last digits as they were written, by field.
+    """
+    yield from _ask_about_digits(curve, rounding)
+    for quantity in QUANTITIES.values():
+        values = getattr(curve, quantity.field)
+        if quantity.measured and values is not None and not quantity.column.endswith("_err"):
+            largest = float(np.max(np.asarray(values)))
+            if largest > 0 and not _is_usual(quantity.column, largest):
+                yield _unit_question(quantity.column, largest, "")
+    if gas is None or gas.drive is not None:
+        return
+    if not all(_is_usual(key, float(header[key])) for key in REQUIRED if key in header):
+        return  # `ask_about_header` asks first
+    number = files.header_count(header, "N")
+    yield from _ask_about_start(curve, header, gas, number)
+    if number is not None and curve.temperature_error is not None:
+        replicas = files.header_count(header, "replicas") or 1
+        share = np.asarray(curve.temperature_error) / np.asarray(curve.temperature)
+        expected = sqrt(2 / (gas.dimension * number * replicas))
+        ratios = {"larger": share[1:].min() / expected, "smaller": expected / share.max()}
+        for word, ratio in ratios.items():
+            if ratio > MAX_ERROR_RATIO:
+                yield (
+                    f"T_err is at least {ratio:.2g} times {word} than the scatter of T of N = "
+                    f"{number:g} particles in {replicas:g} run(s): are N, replicas and T_err those "
+                    "of this curve, and is T_err a standard error of the mean?"
+                )
+
+
+def _ask_about_digits(curve: CoolingCurve, rounding: dict[str, np.ndarray]) -> Iterator[str]:
+    for name, digit in rounding.items():
+        errors = getattr(curve, f"{name}_error")
+        column = QUANTITIES[name].column
+        if errors is None:
+            continue
+        given = np.asarray(errors) > 0
+        coarse = given & (np.asarray(errors) < digit / sqrt(12))
+        if np.sum(coarse) > np.sum(given) / 2:
+            i = int(np.argmax(coarse))
+            yield (
+                f"{column}_err, {errors[i]:.2g}, is less than the digits of {column} tell, "
+                f"{digit[i]:.2g}/sqrt(12): the rounding counts as an error in addition. Write more "
+                f"digits of {column}"
+            )
+
+
+def _ask_about_start(
+    curve: CoolingCurve, header: dict[str, str], gas: Gas, number: int | None
+) -> Iterator[str]:
+    """Compare T at first with T0, the clock with T0, and the loss with the mean free time."""
+    header = {"t0": "0", "T0_err": "0"} | header
+    times = np.asarray(curve.times) - files.header_number(header, "t0")
+    T, T0 = np.asarray(curve.temperature), float(gas.temperature)
+    rows = slice(0, max(4, int(np.sum(0.4 * T[0] < T))))
+    line = (T[rows] / T0) ** -0.6  # straight in time for viscoelastic spheres
+    slope, origin = np.polyfit(times[rows] - times[0], line, 1, w=1 / line)
+    if slope <= 0 or not np.isfinite(slope):
+        return
+    first = origin ** (-1 / 0.6)
+    begin = times[0] + (1 - origin) / slope  # where the line reaches T0
+    halving = (2**0.6 - 1) * max(origin, 0.1) / slope
+    chance = 4 * sqrt(2 / (gas.dimension * number)) if number else 0.0
+    known = 3 * files.header_number(header, "T0_err") / T0
+    at_zero = max(origin - slope * times[0], 1e-9) ** (-1 / 0.6)
+    if first > MAX_RATIO + chance + known:
+        yield _scale_question(first, gas, number)
+    elif begin > MAX_LATENESS * halving and begin > 0.5 * times[0]:
+        yield (
+            f"T is T0 = {T0:g} m^2/s^2 at t = {begin:.6g} s and not at 0, by the first rows: does "
+            "the clock of the file start earlier than the gas? Then subtract that time, or fit it: "
+            "--free A t0. Or is T0 another one? Then --free A T0"
+        )
+    elif at_zero < 1 / (MAX_RATIO + chance + known):
+        yield _scale_question(at_zero, gas, number)
+    loss = gas.dimension * slope / (0.6 * origin) / float(_collision_frequency(gas))
+    if T[-1] < 0.8 * T[0] and not USUAL_LOSS[0] <= loss <= USUAL_LOSS[1]:
+        units = [unit for unit in OTHER_UNITS["s"] if 1e-3 < loss / unit_in(unit, "s") < 1]
+        question = "are t, eta, diameter and T0 in the units that the file says?"
+        if units:
+            question = f"is t in {' or '.join(units)}? Then name the column t ({units[0]})"
+        if loss < 1:
+            question += "; is it in steps or frames? Then multiply it by their duration"
+        yield (
+            f"T falls to a half in {halving / float(gas.mean_free_time):.3g} mean free times of "
+            f"the header's gas (eta, diameter, T0), and usual is .1 to 1e3: {question}"
+        )
+
+
+@eqx.filter_jit
+def _collision_frequency(gas: Gas) -> Array:
+    return gas.collision_frequency
+
+
+def _scale_question(ratio: float, gas: Gas, number: int | None) -> str:
+    """Return the question for T that begins at another value than T0."""
+    d, mass, T0 = gas.dimension, float(gas.mass), float(gas.temperature)
+    meanings = [
+        (d, "<v^2>, not divided by the dimension"),
+        (2, "<v_x^2 + v_y^2>? Then name the column v2_xy. Is it twice T"),
+        (1 / T0, "T over T0"),
+        (d / 2, "the energy over the mass"),
+        (mass, "m <v^2>/d, in J"),
+        (d * mass / 2, "the energy of a particle, in J? Then name the column energy. Is it that"),
+        (d * mass / 2 * (number or np.nan), "the energy of all particles, in J"),
+        (mass / BOLTZMANN, "in kelvin, m <v^2>/(d k_B)"),
+        (1e4, "in cm^2/s^2"),
+        (1e6, "in mm^2/s^2"),
+    ]
+    near = [(f, words) for f, words in meanings if abs(np.log(ratio / f)) < 0.12]
+    question = "do both have the unit m^2/s^2, and are both <v^2>/d?"
+    if near:
+        factor, words = near[0]
+        question = f"is the column {words}? Then multiply it by {1 / factor:.6g}"
+    return (
+        f"T is {ratio * T0:.4g} at first, {ratio:.3g} times the header's T0 = {T0:g} m^2/s^2: "
+        f"{question}; or correct T0, or fit it: --free A T0"
+    )

@@ -1,0 +1,431 @@
+"""The likelihood of a measured curve: one function, which `log_likelihood` and every fit call.
+
+The residuals of a run of N grains are a Gaussian process. Between two times the fluctuations about
+kinetic theory obey a linear stochastic equation (`jaxgran.theory.covariance`); its solution is
+compared with the measured values one after the other, as a Kalman filter does. Each value then has
+an innovation, its residual minus what is expected from all values before it, and the variance of
+that: ``-2 ln L = sum innovation^2/variance + ln variance``. No matrix of all points is formed, so
+that a curve of a thousand points costs no more than its points.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxgran.data.curve import DEFAULTS, CoolingCurve
+from jaxgran.data.measurement import Measurement
+from jaxgran.fitting.parameters import guess_from_data
+from jaxgran.fitting.rows import (
+    CALIBRATION,
+    ROTATION,
+    Displacement,
+    Noise,
+    Observed,
+    curve_rows,
+    times_with_nodes,
+    with_rate_error,
+)
+from jaxgran.models.base import AbstractModel
+from jaxgran.models.checks import checked_model
+from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.scene.gas import Gas
+from jaxgran.theory.covariance import (
+    NUM_DOUBLINGS,
+    ROTATION_OFFSET,
+    Mean,
+    product,
+    propagators,
+    run_process,
+    transposed,
+)
+from jaxgran.theory.equations import Spins
+
+RATE_ERROR_LENGTH = 1.0
+"""Change of ln T over which the error of theory's cooling rate is correlated."""
+
+SAMPLE_MEMORY = 0.57
+"""Decay of the sampling error of T, over the collisions of a grain.
+
+Measured: 60 of 250 spheres, eps = .9, 400 replicas: correlations .75, .56, .42, .33, .26, .20 after
+.5, 1, ..., 3 collisions."""
+
+LOG_FROM, LINEAR_TO = 10.0, 5.0
+"""T over its error above which ln T is compared, and below which T itself is."""
+
+SCATTER_STEPS = {True: np.linspace(-3.0, 3.0, 7), False: np.linspace(-2.5, 2.5, 25)}
+"""Values of the logarithm of N over which a likelihood is integrated, in standard errors of its
+prior, where N is known and where it is not."""
+
+SMALLEST_VARIANCE = 1e-12
+"""Variance of a value that is given without an error and has none by theory, relative."""
+
+
+class Nodes(NamedTuple):
+    """Curves of some neighbouring gases at times that begin at 0 and include those of the data.
+
+    Arrays have the shape (nodes, gases): operations on small matrices are fast where the last axis
+    is long.
+
+    Attributes:
+        times: t, s, not decreasing, shape (nodes,).
+        log_temperature: ln T, T in m^2/s^2.
+        rotation: T_rot/T; 0 for smooth spheres.
+        sonine: a_2, shape (nodes,).
+        collisions: per particle.
+    """
+
+    times: Any
+    log_temperature: Any
+    rotation: Any
+    sonine: Any
+    collisions: Any
+
+
+def log_ratio(values: Array, log_computed: Array, errors: Array) -> Array:
+    """Return the residual of a measured value, relative to the computed one.
+
+    It is ln(measured/computed) where the computed value is many errors above 0, and their
+    difference over the computed value where it is within some errors of 0; in between a mean of
+    both, so that it is continuous. The choice is by the computed value alone: one by the measured
+    value would favour large ones.
+    """
+    computed = jnp.exp(log_computed)
+    ratio = values / computed
+    # Continued to small and negative ratios by its tangent.
+    low = 0.5
+    log = jnp.where(ratio > low, jnp.log(jnp.maximum(ratio, low)), jnp.log(low) + ratio / low - 1)
+    distance = computed / jnp.where(errors > 0, errors, jnp.finfo(errors.dtype).tiny)
+    share = jnp.clip((distance - LINEAR_TO) / (LOG_FROM - LINEAR_TO), 0.0, 1.0)
+    share = share**2 * (3 - 2 * share)
+    return jnp.where(share < 1, share * log + (1 - share) * (ratio - 1), log)
+
+
+def innovations(
+    gas: Gas,
+    nodes: Nodes,
+    log_computed: Float[Array, "nodes 2 gases"],
+    sensitivity: Float[Array, "nodes gases"],
+    observed: Observed,
+    noise: Noise,
+) -> tuple[Float[Array, "nodes 2 gases"], Float[Array, "nodes 2 gases"]]:
+    """Return the innovations of a measured curve about some gases, and their variances.
+
+    Args:
+        gas: neighbouring scenes: its floats have an axis (gases,).
+        nodes: their curves by kinetic theory.
+        log_computed: ln T and ln T_rot with which the measured values are compared.
+        sensitivity: derivative of the computed ln T in ln T of the gas: 1 without a noise floor.
+        observed: the measured values.
+        noise: what makes them scatter; its `scatter` has the shape (gases,).
+    """
+    values = observed.values[..., None]
+    errors = observed.errors[..., None]
+    residuals = log_ratio(values, log_computed, errors)
+    variances = (errors / jnp.exp(log_computed)) ** 2 + observed.simulation[..., None]
+    variances = variances.at[:, 0].add(noise.white**2)
+    found, spread = filtered(
+        gas, nodes, residuals[:, :, None], variances, sensitivity, observed.used, noise
+    )
+    return found[:, :, 0], spread
+
+
+def filtered(
+    gas: Gas,
+    nodes: Nodes,
+    residuals: Float[Array, "nodes 2 columns gases"],
+    variances: Float[Array, "nodes 2 gases"],
+    sensitivity: Float[Array, "nodes gases"],
+    used: Float[Array, "nodes 2"],
+    noise: Noise,
+    differentiable: bool = False,
+) -> tuple[Float[Array, "nodes 2 columns gases"], Float[Array, "nodes 2 gases"]]:
+    """Return the innovations of columns of residuals, and the variances that they share.
+
+    An innovation is 0 where nothing is used, and the variance is then that which a value would
+    have.
+
+    Args:
+        residuals: of T and of T_rot, relative.
+        variances: of their independent errors.
+        gas, nodes, sensitivity, used, noise: see `innovations`.
+        differentiable: whether derivatives in reverse mode are taken.
+    """
+    with jax.numpy_rank_promotion("allow"):  # the gases are the last axis of all arrays
+        steps = _steps(gas, nodes, noise, differentiable)
+        return _run_filter(steps, residuals, variances, sensitivity, used, noise)
+
+
+def _run_filter(
+    steps: tuple[Array, Array, Array],
+    residuals: Float[Array, "nodes 2 columns gases"],
+    variances: Float[Array, "nodes 2 gases"],
+    sensitivity: Float[Array, "nodes gases"],
+    used: Float[Array, "nodes 2"],
+    noise: Noise,
+) -> tuple[Float[Array, "nodes 2 columns gases"], Float[Array, "nodes 2 gases"]]:
+    changes, increments, of_rotation = steps
+    dtype = residuals.dtype
+    lanes = residuals.shape[-1]
+    size = changes.shape[1]
+    rate_error, sample = size - 2, size - 1
+    first = jnp.zeros((size, size, lanes), dtype)
+    first = first.at[0, 0].set(noise.scatter * noise.first)
+    first = first.at[rate_error, rate_error].set(1.0)
+    first = first.at[sample, sample].set(noise.sample)
+    mean = jnp.zeros((size, *residuals.shape[2:]), dtype)
+    variances = variances + SMALLEST_VARIANCE
+
+    def update(state, covariance_with, own, expected, value, variance, is_used):
+        """Return the state after a value, its innovation and its variance.
+
+        `covariance_with` are the covariances of the variables with the value, and `own` its
+        variance, both without its own error.
+        """
+        mean, covariance = state
+        spread = own + variance
+        innovation = is_used * (value - expected)
+        gain = is_used * covariance_with / spread
+        mean = mean + gain[:, None] * innovation[None]
+        covariance = covariance - spread * gain[:, None] * gain[None]
+        return (mean, covariance), innovation, spread
+
+    def step(state, at):
+        mean, covariance = state
+        change, increment, share, by_rotation, value, variance, is_used = at
+        mean = mean + jnp.sum(change[:, :, None] * mean[None], axis=1)
+        moved = covariance + product(change, covariance)
+        covariance = moved + product(moved, transposed(change)) + increment
+        # T is that of the gas, with the sampling error.
+        along = share * covariance[:, 0] + covariance[:, sample]
+        own = share * along[0] + along[sample]
+        expected = share * mean[0] + mean[sample]
+        (mean, covariance), one, spread = update(
+            (mean, covariance), along, own, expected, value[0], variance[0], is_used[0]
+        )
+        # ln T_rot is ln T and the logarithm of the ratio.
+        ratio = min(1, size - 3)
+        along = covariance[:, 0] + by_rotation * covariance[:, ratio]
+        own = along[0] + by_rotation * along[ratio]
+        expected = mean[0] + by_rotation * mean[ratio]
+        state, other, further = update(
+            (mean, covariance), along, own, expected, value[1], variance[1], is_used[1]
+        )
+        return state, (jnp.stack([one, other]), jnp.stack([spread, further]))
+
+    at = changes, increments, sensitivity, of_rotation, residuals, variances, used
+    return jax.lax.scan(step, (mean, first), at)[1]
+
+
+def _steps(
+    gas: Gas, nodes: Nodes, noise: Noise, differentiable: bool
+) -> tuple[Array, Array, Array]:
+    """Return what happens to the variables from each node's predecessor to it.
+
+    The variables are those of the run (`jaxgran.theory.covariance.process`), followed by the
+    relative error of theory's cooling rate over its standard deviation, and by the sampling error.
+
+    Returns:
+        propagators less 1, and the noise that is added, shape (nodes, n, n, gases); and the
+        derivative of ln T_rot in the second variable, shape (nodes, gases).
+    """
+    first = nodes.log_temperature[:1]
+    means = Mean(
+        nodes.log_temperature - first,
+        jnp.broadcast_to(nodes.sonine[:, None], nodes.rotation.shape),
+        nodes.collisions,
+        Spins(nodes.rotation, None, None),
+    )
+    rates = jax.vmap(run_process, in_axes=(0, -1), out_axes=-1)
+    jacobian, spread = rates(gas, jax.tree.map(_middle, means))
+    collisions = _change(nodes.collisions)
+    size = len(jacobian) + 2
+    of_run = slice(0, size - 2)
+    rate_error, sample = size - 2, size - 1
+    drift = jnp.zeros((size, size, *nodes.rotation.shape), jacobian.dtype)
+    noises = drift.at[of_run, of_run].set(noise.scatter * spread * collisions)
+    drift = drift.at[of_run, of_run].set(jacobian * collisions)
+    # An error of the rate moves all temperatures along their mean course.
+    error = _middle(noise.rate_error)[:, None]
+    of_T = _change(nodes.log_temperature)
+    drift = drift.at[0, rate_error].set(error * of_T)
+    if gas.surface is not None:
+        of_ratio = _change(jnp.log(nodes.rotation + ROTATION_OFFSET))
+        drift = drift.at[1, rate_error].set(error * of_ratio)
+    memory = jnp.abs(of_T) / RATE_ERROR_LENGTH
+    drift = drift.at[rate_error, rate_error].set(-memory)
+    noises = noises.at[rate_error, rate_error].set(2 * memory)
+    forgotten = SAMPLE_MEMORY * collisions
+    drift = drift.at[sample, sample].set(-forgotten)
+    noises = noises.at[sample, sample].set(2 * forgotten * noise.sample)
+    flat = size, size, -1
+    needed: Any = NUM_DOUBLINGS
+    if not differentiable:
+        # A step is so short that no variable changes by more than 1/64 of itself.
+        longest = jnp.max(jnp.abs(drift))
+        needed = jnp.clip(jnp.ceil(jnp.log2(64 * longest)), 1, NUM_DOUBLINGS).astype(int)
+    found = propagators(drift.reshape(flat), noises.reshape(flat), needed)
+    changes, increments = (jnp.moveaxis(x.reshape(drift.shape), 2, 0) for x in found)
+    turning = nodes.rotation > 0
+    of_rotation = (nodes.rotation + ROTATION_OFFSET) / jnp.where(turning, nodes.rotation, jnp.inf)
+    return changes, increments, of_rotation
+
+
+def _middle(x: Array) -> Array:
+    """Return means of neighbours along the first axis, from a predecessor of the first on."""
+    return jnp.concatenate([x[:1], (x[1:] + x[:-1]) / 2])
+
+
+def _change(x: Array) -> Array:
+    """Return differences of neighbours along the first axis, 0 for the first."""
+    return jnp.diff(x, prepend=x[:1], axis=0)
+
+
+def log_likelihood(
+    gas: Gas, measurement: Measurement, *, model: AbstractModel | None = None
+) -> Float[Array, ""]:
+    """Logarithm of the likelihood of a measured curve, up to a constant.
+
+    It is the likelihood that `jaxgran.fit` maximises, without priors: ``-(r^T C^-1 r + ln det
+    C)/2`` with the residuals r of ln T, and of ln T_rot and <dr^2> where they are compared, and
+    their covariance C by the collisions of N grains, the errors of the measurement and the error
+    of theory's cooling rate. Common factors of T_rot and of <dr^2>, the scale of T, and the
+    scatter of N grains (any N, where it is not known) are integrated out.
+
+    This is a pure function of the gas, for `jax.jit`, `jax.vmap` and `jax.grad`;
+    `experiments/fit/sample_posterior.py` adds priors and samples it.
+
+    Args:
+        gas: the scene; its values may be traced.
+        measurement: of a curve.
+        model: a model without noise, by default `jaxgran.KineticTheory()`.
+
+    Returns:
+        The logarithm; -inf if the model cannot compute the curve.
+
+    Raises:
+        ValueError: for a drop test, a scene that the model does not support, or a stochastic model,
+            whose noise differs between calls.
+
+    >>> measurement = jaxgran.Measurement(gas, curve, num_particles=1000)
+    >>> other = gas.replace(dissipative_constant=4e-6)
+    >>> likelihood = jaxgran.log_likelihood(gas, measurement)
+    >>> bool(likelihood > jaxgran.log_likelihood(other, measurement))
+    True
+    """
+    model = KineticTheory() if model is None else model
+    if checked_model(model).stochastic:
+        raise ValueError(
+            f"a likelihood needs a model without noise, got {type(model).__name__}, which is "
+            "stochastic. Use jaxgran.KineticTheory()"
+        )
+    if not isinstance(measurement, Measurement):
+        raise ValueError(f"measurement must be a jaxgran.Measurement, got {measurement!r:.60}")
+    model.check_scene(gas)
+    with jax.ensure_compile_time_eval():  # the measurement is known, where the gas is traced
+        rows, _ = curve_rows("", measurement, model, fits_T_0=False, fits_t0=False)
+        times, place = times_with_nodes(np.asarray(rows.curve.times) * rows.faster, rows.unit_time)
+        guess = guess_from_data(measurement.gas, rows.curve, ANY_CONSTANT)
+        rows = with_rate_error(rows, model, guess)
+    computed = model.simulate(gas, jnp.asarray(times), DEFAULTS)
+    nothing = jnp.zeros_like(computed.temperature)
+    log_T = jnp.log(computed.temperature)
+    T_rot = computed.rotational_temperature
+    ratio = nothing if T_rot is None else T_rot / computed.temperature
+    speed = jnp.sqrt(computed.temperature / gas.temperature)
+    steps = jnp.diff(times) * (speed[1:] + speed[:-1]) / 2 * gas.collision_frequency
+    collisions = jnp.append(0.0, jnp.cumsum(steps))
+    collisions = collisions if computed.collisions is None else computed.collisions
+    nodes = Nodes(
+        jnp.asarray(times),
+        log_T[:, None],
+        ratio[:, None],
+        nothing if computed.sonine is None else computed.sonine,
+        collisions[:, None],
+    )
+    observed = jax.tree.map(jnp.asarray, rows.at_nodes(times.size, place))
+    logs = jnp.stack([log_T, log_T + jnp.log(jnp.where(ratio > 0, ratio, 1.0))], axis=1)
+    residuals = log_ratio(observed.values, logs, observed.errors)
+    variances = (observed.errors / jnp.exp(logs)) ** 2
+    columns = [residuals]
+    widths = []
+    for name, shape in ((ROTATION, (0.0, 1.0)), (CALIBRATION, (1.0, 1.0))):
+        if name in rows.nuisances:
+            columns.append(jnp.broadcast_to(jnp.asarray(shape), residuals.shape))
+            widths.append(rows.nuisances[name])
+    log_scatters = SCATTER_STEPS[measurement.num_particles is not None]
+    count = log_scatters.size
+
+    def for_each(x: Array) -> Array:
+        return jnp.broadcast_to(x[..., None], (*x.shape, count))
+
+    each = Nodes(
+        nodes.times,
+        jnp.repeat(nodes.log_temperature, count, axis=1),
+        jnp.repeat(nodes.rotation, count, axis=1),
+        nodes.sonine,
+        jnp.repeat(nodes.collisions, count, axis=1),
+    )
+    values, spread = filtered(
+        jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *jnp.shape(x))), gas),
+        each,
+        for_each(jnp.stack(columns, axis=-1)),
+        for_each(variances),
+        for_each(jnp.ones_like(log_T)),
+        observed.used,
+        jax.tree.map(
+            jnp.asarray,
+            rows.noise(times, rows.scatter * jnp.exp(rows.scatter_error * log_scatters)),
+        ),
+        differentiable=True,
+    )
+    used = observed.used
+
+    def of_scatter(values: Array, spread: Array, step: Array) -> Array:
+        found = _without_factors(values, used / spread, jnp.asarray(widths))
+        return -0.5 * (found + jnp.sum(used * jnp.log(spread)) + step**2)
+
+    value = jax.scipy.special.logsumexp(
+        jax.vmap(of_scatter, in_axes=(-1, -1, 0))(values, spread, jnp.asarray(log_scatters))
+    )
+    if rows.displacement is not None:
+        assert computed.displacement is not None
+        counts = collisions[place]
+        value = value - 0.5 * _of_displacement(rows.displacement, counts, computed, place)
+    return jnp.where(jnp.isnan(value), -jnp.inf, value)
+
+
+ANY_CONSTANT = ("dissipative_constant", "coefficient", "drops")
+"""Parameters of laws that `guess_from_data` knows."""
+
+
+def _without_factors(values: Array, weights: Array, widths: Array) -> Array:
+    """Return the sum of weighted squares of the first column, with factors of the others
+    integrated out, which are known to be 0 within their widths."""
+    flat = values.reshape(-1, values.shape[-1])
+    weights = weights.reshape(-1)
+    square = jnp.sum(weights * flat[:, 0] ** 2)
+    if not widths.size:
+        return square
+    others = flat[:, 1:] * widths[None]
+    projection = others.T @ (weights * flat[:, 0])
+    matrix = jnp.eye(widths.size) + others.T @ (weights[:, None] * others)
+    return (
+        square - projection @ jnp.linalg.solve(matrix, projection) + jnp.linalg.slogdet(matrix)[1]
+    )
+
+
+def _of_displacement(
+    measured: Displacement, collisions: Array, computed: CoolingCurve, place: np.ndarray
+) -> Array:
+    assert computed.displacement is not None
+    used = measured.errors > 0
+    errors = np.where(used, measured.errors, 1.0)
+    diffusive = collisions / (1 + collisions)
+    values = jnp.log(np.where(used, measured.values, 1.0))
+    difference = values - jnp.log(jnp.where(used, computed.displacement[place], 1.0))
+    columns = jnp.stack([difference, diffusive], axis=-1)
+    weights = jnp.asarray(used / errors**2)
+    return _without_factors(columns, weights, jnp.asarray([measured.accuracy]))

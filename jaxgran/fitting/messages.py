@@ -1,0 +1,364 @@
+"""What a fit says: the range in one line, a verdict, and the reasons for it.
+
+`MESSAGES` holds all sentences; the functions below choose and fill them.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from jaxgran.fitting.alternatives import DECLARABLE, Explanations
+from jaxgran.fitting.result import CONDITIONAL, Fit
+from jaxgran.models.base import Limitation
+from jaxgran.scene.parameters import symbol_of, unit_of
+
+SIGNIFICANCE = 0.01
+"""Level of significance of the test of the misfit, half of it on each side."""
+
+NEGLIGIBLE_SHARE = 0.01
+"""Share of an estimate below which the low end of a range counts as 0."""
+
+MAX_RATIO = 3.0
+"""Ratio of the ends of a range from which on a positive parameter is not determined."""
+
+UNBOUNDED = 1e3
+"""The same of the high end to the estimate, above which the range has no high end."""
+
+MIN_PARTICLES = 50
+"""Particles of a model from which on the noise of its curves is known."""
+
+DETERMINED, NOT_DETERMINED, NOT_CONSISTENT = "determined", "not determined", "not consistent"
+"""Grades of `Fit.grade`."""
+
+MESSAGES = {
+    # the first line
+    "estimate alone": "{symbol} = {estimate:.4g} +- {error:.2g} {unit} {conditional}",
+    "estimate and range": "{symbol} = {estimate:.3g} {unit}, 95 % range {low:.3g} to {high:.3g} "
+    "{unit}",
+    "range alone": "{range} (95 %)",
+    "between": "{symbol} is between {low:.3g} and {high:.3g} {unit}",
+    "below": "{symbol} is below {high:.3g} {unit}",
+    "above": "{symbol} is above {low:.3g} {unit}",
+    "unknown": "{symbol} is not determined",
+    "constant": "{headline}. A constant coefficient of restitution, {eps:.3g}, explains the data "
+    "{as_well}: then A has no meaning",
+    "no meaning": "it is {eps:.3g}, and A has no meaning",
+    "narrowing": "if there is no {effects}, {range}: declare `absent: {names}`, or give {given}",
+    # the verdict
+    "not converged": "The search did not converge: do not trust its estimates.",
+    "not consistent": "{Model} {be} not consistent with this curve: do not trust the estimates."
+    "{preferred} {remedy}",
+    "preferred": " The data prefer a model with {name}.",
+    "not trusted": "{Model} cannot be trusted in this scene, though the curve fits. {remedy}",
+    "determined": "{Model} {be} consistent with this curve, which determines {symbol}: {range}."
+    "{edge}",
+    "not determined": "{Model} {be} consistent with this curve, which does not determine {symbol}: "
+    "{why}.{edge}",
+    "edge": " The scene is at the edge of the model's validity.",
+    "other minima": "other parameters fit this curve as well",
+    "no group": "this curve does not determine {names}",
+    "not compared": "alternatives were not compared",
+    "possible": "{name} cannot be excluded, and {range}",
+    # reasons
+    "chi2": "reduced chi^2 is {reduced:.3g} for {degrees} degrees of freedom (probability by "
+    "chance: {chance} %)",
+    "too rough": "the curve scatters more than N equal spheres can: a mixture of sizes, eps that "
+    "scatters, fewer grains than told, or noise of the measurement",
+    "too smooth": "the curve scatters less than N equal spheres do: grains that walls cool, more "
+    "grains than told, or a curve that was smoothed",
+    "errors too large": "the residuals are smaller than the errors of T allow by chance: these "
+    "errors are too large, or they are common to the points",
+    "scatter": "the scatter is that of {number:.3g} +- {error:.2g} grains",
+    "of each": "{label}: chi^2 is {chi2:.3g} for {number} points; its weight in {symbol} is "
+    "{weight:.2f}",
+    "assumptions": "the model assumes equal{spheres}, {where}",
+    "absent": "known to be absent: {names}",
+    "quick": "alternatives were not compared, as requested",
+    "driven": "additional loss terms were not tested: the gas is driven",
+    "of particles": "the range over alternatives is that of kinetic theory, shifted to the fitted "
+    "curve",
+    "is preferred": "{name} added to the model decreases -2 ln L by {improvement:.3g}, which "
+    "happens by chance in less than 1 % of fits: then {range}",
+    "outside": "the estimate {estimate:.3g} lies outside of this range, because it is that without "
+    "the preferred alternative",
+    "is possible": "{name} cannot be excluded: then {range}; to exclude it, the errors must be "
+    "{factor:.2g} times smaller",
+    "outliers": "far outliers at {places}: check them and their error bars",
+    "without outliers": "; without them {symbol} is {value:.3g} +- {error:.2g}",
+    "max_steps": "the search did not converge: increase max_steps or free fewer parameters",
+    "simulations": "{number} simulations were run; their noise is at most {share:.0f} % of the "
+    "standard error",
+    "few particles": "{number} particles are too few for their noise to be known, and cool faster "
+    "than a gas: give the model {least} or more",
+    "undetermined": "this curve does not determine {names}: {why}; free fewer parameters",
+    "weak": "it hardly depends on this parameter",
+    "combination": "it depends only on a combination of them",
+    "forgets": " (a cooling gas forgets its initial temperature)",
+    "A and Y": " (in a gas of hard spheres A and Y enter only as A Y^(2/5))",
+    "another minimum": "-2 ln L has another, equally good minimum at {places}: this curve does not "
+    "distinguish them",
+    "slopes": "the derivatives through particles err by an estimated {share:.2g} %, which the "
+    "standard error includes: more replicas, or differences=0.3 where the gas has a flow, reduce "
+    "it",
+}
+"""Sentences by name, with places for values."""
+
+
+def say(name: str, /, **values: Any) -> str:
+    """Return a sentence with its values, without blanks that empty values leave."""
+    return " ".join(MESSAGES[name].format(**values).split(" ")).replace("  ", " ").strip()
+
+
+def with_words(
+    result: Fit,
+    explanations: Explanations | None,
+    limitations: tuple[Limitation, ...],
+    notes: list[str],
+    absent: tuple[str, ...],
+    *,
+    quick: bool,
+    measurement_share: float,
+) -> Fit:
+    """Return a fit with its first line, verdict and reasons.
+
+    Args:
+        result: a fit whose numbers are complete.
+        explanations: the fitted law and its alternatives; None if they were not compared.
+        limitations: of the model in the scenes.
+        notes: further reasons.
+        absent: effects that are known to be absent.
+        quick: whether the user did not want the alternatives.
+        measurement_share: share of the errors of the measurement in the variances of T.
+    """
+    limitations = tuple(sorted(limitations, key=lambda limitation: not limitation.decisive))
+    rough = result.p_value < SIGNIFICANCE / 2
+    smooth = result.smooth_p_value < SIGNIFICANCE / 2
+    is_misfit = rough or (smooth and measurement_share < 0.5)
+    grade, verdict = _verdict(result, is_misfit, limitations)
+    reasons = [
+        _chi2(result),
+        *_misfit(rough, smooth, is_misfit),
+        *_scatter(result),
+        *_of_each(result),
+        *_alternatives(result, absent, quick),
+        *notes,
+        *(limitation.words for limitation in limitations),
+        *_convergence(result),
+        *describe_search(result),
+    ]
+    return replace(
+        result,
+        grade=grade,
+        headline=_headline(result),
+        narrowing="" if explanations is None else _narrowing(result, explanations),
+        verdict=verdict,
+        reasons=tuple(reasons),
+    )
+
+
+def _unit_of(result: Fit) -> dict[str, str]:
+    name = result.names[0]
+    return {"symbol": symbol_of(name), "unit": unit_of(name)}
+
+
+def _range(result: Fit, low: float, high: float) -> str:
+    """Say in which range the first parameter lies."""
+    estimate = abs(float(result.estimate[0]))
+    ends = {"low": low, "high": high} | _unit_of(result)
+    is_open = not high < UNBOUNDED * max(estimate, low)
+    if 0 <= low < NEGLIGIBLE_SHARE * estimate:
+        return say("unknown" if is_open else "below", **ends)
+    return say("above" if is_open else "between", **ends)
+
+
+def _headline(result: Fit) -> str:
+    """Return the first parameter with its range, and whether it has a meaning."""
+    headline = _first_parameter(result)
+    for alternative in result.alternatives:
+        if alternative.restitution is not None and alternative.improvement >= 0:
+            as_well = "better" if alternative.preferred else "as well"
+            return say("constant", headline=headline, eps=alternative.restitution, as_well=as_well)
+    return headline
+
+
+def _first_parameter(result: Fit) -> str:
+    """Return the first parameter with its range; without it if that lies outside of the range."""
+    name = result.names[0]
+    estimate, error = (float(np.ravel(x)[0]) for x in result.value(name))
+    values = {"estimate": estimate, "error": error, "conditional": CONDITIONAL} | _unit_of(result)
+    if name not in result.ranges:
+        return say("estimate alone", **values)
+    low, high = (float(x[0]) for x in result.ranges[name])
+    is_wide = low < NEGLIGIBLE_SHARE * abs(estimate) or high > MAX_RATIO * low
+    if not low <= estimate <= high or (low >= 0 and is_wide):
+        return say("range alone", range=_range(result, low, high))
+    return say("estimate and range", low=low, high=high, **values)
+
+
+def _narrowing(result: Fit, explanations: Explanations) -> str:
+    """Return which effects, known to be absent, would narrow the range of the first parameter."""
+    wide = [x for x in explanations.alternatives if x.effect and not x.distinguishable]
+    others = [x for x in (explanations.law, *explanations.alternatives) if x not in wide]
+    best = max(x.improvement for x in (explanations.law, *explanations.alternatives))
+    if not wide or max(x.improvement for x in others) < best - 2 * NARROWING_LOSS:
+        return ""
+    effects = sorted({x.effect for x in wide})
+    low, high = explanations.ranges(without=wide)
+    return say(
+        "narrowing",
+        effects=" and no ".join(effects),
+        range=_range(result, float(low[0]), float(high[0])),
+        names=", ".join(effects),
+        given=", ".join(DECLARABLE[effect][1] for effect in effects),
+    )
+
+
+NARROWING_LOSS = 2.5
+"""Half of the increase of -2 ln L beyond which explanations without some effects do not explain the
+data."""
+
+
+def _verdict(result: Fit, is_misfit: bool, limitations: tuple[Limitation, ...]) -> tuple[str, str]:
+    """Return the grade of a fit, and the verdict in words."""
+    name = result.model_name
+    words = {
+        "Model": name[:1].upper() + name[1:],
+        "be": "are" if name.endswith("s") else "is",
+        "remedy": " ".join(limitation.remedy for limitation in limitations[:1]),
+        "edge": say_edge(limitations),
+        "symbol": symbol_of(result.names[0]),
+    }
+    preferred = [alternative for alternative in result.alternatives if alternative.preferred]
+    if not result.converged:
+        return NOT_CONSISTENT, say("not converged")
+    if is_misfit or preferred:
+        best = MESSAGES["preferred"].format(name=preferred[0].name) if preferred else ""
+        return NOT_CONSISTENT, say("not consistent", preferred=best, **words)
+    if any(limitation.decisive for limitation in limitations):
+        return NOT_CONSISTENT, say("not trusted", **words)
+    possible = [a.name for a in result.alternatives if not a.distinguishable]
+    group = result.undetermined
+    if len(result.other_minima):
+        why = say("other minima")
+    elif result.names[0] in group:
+        why = say("no group", names=" and ".join(map(symbol_of, group)))
+    elif not result.ranges:
+        why = say("not compared")
+    else:
+        low, high = (float(x[0]) for x in result.ranges[result.names[0]])
+        span = _range(result, low, high)
+        if not possible and not (low >= 0 and high > MAX_RATIO * low):
+            return DETERMINED, say("determined", range=span, **words)
+        why = say("possible", name=possible[0], range=span) if possible else span
+    return NOT_DETERMINED, say("not determined", why=why, **words)
+
+
+def say_edge(limitations: tuple[Limitation, ...]) -> str:
+    """Return a sentence on limitations that are not decisive, with a blank before it."""
+    return MESSAGES["edge"] if limitations else ""
+
+
+def _chi2(result: Fit) -> str:
+    chance = f"{100 * result.p_value:.2g}" if result.p_value < 0.99 else "over 99"
+    degrees = int(result.degrees_of_freedom)
+    return say("chi2", reduced=result.reduced_chi2, degrees=degrees, chance=chance)
+
+
+def _misfit(rough: bool, smooth: bool, is_misfit: bool) -> Iterator[str]:
+    if rough:
+        yield say("too rough")
+    if smooth:
+        yield say("too smooth" if is_misfit else "errors too large")
+
+
+def _scatter(result: Fit) -> Iterator[str]:
+    """Yield N by the scatter of each curve for which it is not known."""
+    for label, (ratio, error) in result.scatter.items():
+        if result.measurements[label].num_particles is None and error < 1.0:
+            number = 1e3 / ratio
+            prefix = f"{label}: " if label else ""
+            yield prefix + say("scatter", number=number, error=number * error)
+
+
+def _of_each(result: Fit) -> Iterator[str]:
+    """Yield the misfit and the weight of each of several measurements."""
+    if len(result.measurements) < 2:
+        return
+    for label, residuals in result.residuals.items():
+        values = np.concatenate(list(residuals.values()))
+        yield say(
+            "of each",
+            label=label,
+            chi2=float(np.sum(values**2)),
+            number=int(np.sum(values != 0)),
+            symbol=symbol_of(result.names[0]),
+            weight=result.weights[label][0],
+        )
+
+
+def _alternatives(result: Fit, absent: tuple[str, ...], quick: bool) -> Iterator[str]:
+    """Yield clauses about preferred or possible alternatives, with the first parameter there."""
+    yield _assumptions(result)
+    if absent:
+        yield say("absent", names=", ".join(absent))
+    if quick:
+        yield say("quick")
+    if any(m.gas.drive is not None for m in result.measurements.values()):
+        yield say("driven")
+    if result.model is not None and result.model.stochastic and result.alternatives:
+        yield say("of particles")
+    estimate = float(result.estimate[0])
+    for alternative in result.alternatives:
+        low, high = float(alternative.low[0]), float(alternative.high[0])
+        span = _range(result, low, high)
+        if alternative.restitution is not None:
+            span = say("no meaning", eps=alternative.restitution)
+        if alternative.preferred:
+            name, improvement = alternative.name, alternative.improvement
+            yield say("is preferred", name=name, improvement=improvement, range=span)
+            if not low <= estimate <= high:
+                yield say("outside", estimate=estimate)
+        elif not alternative.distinguishable:
+            factor = alternative.error_reduction_needed
+            yield say("is possible", name=alternative.name, range=span, factor=factor)
+
+
+def _assumptions(result: Fit) -> str:
+    elements = {e for m in result.measurements.values() for e in m.gas.elements}
+    spheres = ", rough spheres of constant beta_t" if "surface" in elements else ", smooth spheres"
+    spheres = " spheres of constant friction" if "friction" in elements else spheres
+    where = [] if "container" in elements else ["far from walls"]
+    where += [] if "drag" in elements else ["in vacuum"]
+    where.append("at homogeneous density")
+    return say("assumptions", spheres=spheres, where=", ".join(where))
+
+
+def _convergence(result: Fit) -> Iterator[str]:
+    """Yield clauses about convergence and the noise of simulations."""
+    if not result.converged:
+        yield say("max_steps")
+    noise = result.error_budget.get("simulation")
+    if noise is not None:
+        share = 100 * float(np.max(noise / result.standard_error))
+        yield say("simulations", number=result.iterations, share=share)
+
+
+def describe_search(result: Fit) -> Iterator[str]:
+    """Yield clauses on few particles, undetermined parameters and equally good minima."""
+    number = getattr(result.model, "num_particles", MIN_PARTICLES)
+    if number < MIN_PARTICLES:
+        yield say("few particles", number=number, least=MIN_PARTICLES)
+    if group := result.undetermined:
+        why = MESSAGES["combination" if len(group) > 1 else "weak"]
+        if any(name.endswith("t0") for name in group):
+            why += MESSAGES["forgets"]
+        elif {"dissipative_constant", "youngs_modulus"} <= {*group}:
+            why += MESSAGES["A and Y"]
+        yield say("undetermined", names=" and ".join(map(symbol_of, group)), why=why)
+    if len(result.other_minima):
+        symbols = [symbol_of(name) for name in result.names]
+        sets = [zip(symbols, other, strict=False) for other in result.other_minima]
+        places = [", ".join(f"{name} = {x:.3g}" for name, x in each) for each in sets]
+        yield say("another minimum", places=" and at ".join(places))

@@ -1,0 +1,266 @@
+"""The problem of a fit: measurements, unknowns, and -2 ln L with its derivatives."""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxgran._utils.validation import Domain
+from jaxgran.data.measurement import START_TIME, Priors
+from jaxgran.fitting.parameters import (
+    SHARED,
+    Unknown,
+    domain_of,
+    extra_parameters,
+    halving_time,
+    prior_residuals,
+    residuals_and_slopes,
+)
+from jaxgran.fitting.prediction import Element, Residuals, predicted_curve
+from jaxgran.fitting.rows import CurveRows, DropRows
+from jaxgran.models.base import AbstractModel
+from jaxgran.scene.gas import Gas
+
+
+class Evaluation(NamedTuple):
+    """-2 ln L at some values of the unknowns.
+
+    Attributes:
+        value: -2 ln L, up to a constant.
+        gradient: its derivatives.
+        information: half of its expected second derivatives.
+        rows: the residuals.
+        curves: the computed curves at the times of the data, dictionaries of their fields.
+    """
+
+    value: float
+    gradient: Float[np.ndarray, "unknowns"]
+    information: Float[np.ndarray, "unknowns unknowns"]
+    rows: list[Residuals]
+    curves: dict[str, dict[str, Any]]
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether the model could compute the curves."""
+        return bool(np.isfinite(self.value) and np.all(np.isfinite(self.information)))
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Measurements, a model without noise, and the unknowns that are varied.
+
+    Attributes:
+        measurements: curves and drop tests.
+        model: computes the curves.
+        unknowns: the free parameters, then those that vary because of a prior, then nuisance
+            parameters.
+        num_free: number of elements of the free parameters.
+        priors: of shared parameters (`SHARED`) and of those of one measurement, by its label.
+        fixed: SI values of further parameters, by label and name.
+        tolerance: factor of the model's tolerance.
+    """
+
+    measurements: tuple[CurveRows | DropRows, ...]
+    model: AbstractModel
+    unknowns: tuple[Unknown, ...]
+    num_free: int
+    priors: dict[str, Priors]
+    fixed: dict[str, dict[str, Any]] = field(default_factory=dict)
+    tolerance: float = 1.0
+    _last: dict[bytes, Evaluation] = field(init=False, default_factory=dict, compare=False)
+
+    @classmethod
+    def build(
+        cls,
+        measurements: tuple[CurveRows | DropRows, ...],
+        model: AbstractModel,
+        free: tuple[str, ...],
+        separate: tuple[str, ...],
+        priors: dict[str, Priors],
+    ) -> "Problem":
+        """Return the problem of `jaxgran.fit`.
+
+        Args:
+            measurements, model, priors: see the class.
+            free: names of shared free parameters.
+            separate: names of free parameters that each curve has separately.
+        """
+        curves = [m for m in measurements if isinstance(m, CurveRows)]
+        gas = measurements[0].gas
+
+        def unknown(name: str, label: str | None, gas: Gas) -> Unknown:
+            domain = domain_of(gas, name)
+            if name != START_TIME:
+                return Unknown(name, label, jnp.shape(gas.value(name)), domain)
+            unit = halving_time(next(m.curve for m in curves if label in (None, m.label)))
+            return Unknown(name, label, (), domain, float(unit))
+
+        unknowns = [unknown(name, None, gas) for name in free]
+        unknowns += [unknown(name, m.label, m.gas) for name in separate for m in curves]
+        num_free = sum(u.size for u in unknowns)
+        by_label = {SHARED: gas} | {m.label: m.gas for m in measurements}
+        for label, some in priors.items():
+            known = tuple(u.name for u in unknowns if u.label in (None, label))
+            extra = extra_parameters(some, known)
+            unknowns += [unknown(name, label or None, by_label[label]) for name in extra]
+        for m in measurements:
+            unknowns += [Unknown(name, m.label, (), Domain()) for name in m.nuisances]
+        return cls(measurements, model, tuple(unknowns), num_free, priors)
+
+    @cached_property
+    def _simplified_model(self) -> AbstractModel:
+        displacement = any(m.displacement is not None for m in self.curves)
+        scenes = [m.scene for m in self.measurements]
+        return self.model.simplified_for(*scenes, displacement=displacement)
+
+    @property
+    def curves(self) -> tuple[CurveRows, ...]:
+        """The measured curves."""
+        return tuple(m for m in self.measurements if isinstance(m, CurveRows))
+
+    def holding(self, name: str) -> tuple["Problem", np.ndarray]:
+        """Return the problem with the unknowns of a name held at 0, and which ones are left."""
+        unknowns = tuple(u for u in self.unknowns if u.name != name)
+        fixed = {m.label: self.fixed.get(m.label, {}) | {name: 0.0} for m in self.measurements}
+        names = np.repeat([u.name for u in self.unknowns], [u.size for u in self.unknowns])
+        return replace(self, unknowns=unknowns, fixed=fixed), names != name
+
+    def check_points(self) -> None:
+        """Raise ValueError unless curves have more points that count than free parameters."""
+        points = sum(m.num_points for m in self.measurements)
+        if self.curves and points <= self.num_free:
+            raise ValueError(
+                f"{points} points (those with an error of 0 not counted) cannot determine "
+                f"{self.num_free} parameters; free fewer of them"
+            )
+
+    def flat(self, values: dict[str, dict[str, Any]]) -> np.ndarray:
+        """Return SI values, by label and name, in their unconstrained scale, in one array.
+
+        The values are those of all parameters of the gases, and of t0 where it is an unknown;
+        nuisance parameters are 0.
+        """
+        parts = [np.zeros(0)]
+        for u in self.unknowns:
+            label = self.measurements[0].label if u.label is None else u.label
+            value = np.asarray(values[label].get(u.name, 0.0), float)
+            parts.append(np.ravel(u.domain.to_free(value) / u.unit))
+        return np.concatenate(parts)
+
+    def parts(self, flat: Any) -> list[tuple[Unknown, Any]]:
+        """Return each unknown with its SI value."""
+        pairs = []
+        begin = 0
+        for u in self.unknowns:
+            free = flat[begin : begin + u.size].reshape(u.shape)
+            begin += u.size
+            pairs.append((u, u.domain.from_free(free * u.unit)))
+        return pairs
+
+    def estimates(self, flat: np.ndarray) -> np.ndarray:
+        """Return SI values of the free parameters in one array."""
+        values = [np.ravel(value) for _, value in self.parts(flat)]
+        return np.concatenate([flat[:0], *values])[: self.num_free]
+
+    def slopes(self, flat: np.ndarray) -> np.ndarray:
+        """Return the derivative of each SI value in its unconstrained parameter."""
+        slopes = [np.ravel(u.domain.slope(value)) * u.unit for u, value in self.parts(flat)]
+        return np.concatenate([flat[:0], *slopes])
+
+    def values(self, flat: Any) -> dict[str, dict[str, Any]]:
+        """Return SI values of all parameters that are varied, by label and name."""
+        values = {m.label: dict(self.fixed.get(m.label, {})) for m in self.measurements}
+        for u, value in self.parts(flat):
+            for label in values if u.label is None else (u.label,):
+                values[label][u.name] = value
+        return values
+
+    def elements(self, flat: np.ndarray) -> list[Element]:
+        """Return each number of the unknowns, with its derivative in the unconstrained scale."""
+        places = [(u, number) for u in self.unknowns for number in range(u.size)]
+        slopes = self.slopes(flat)
+        return [
+            Element(u.name, u.label, number, place, float(slopes[place]))
+            for place, (u, number) in enumerate(places)
+        ]
+
+    def evaluate(self, flat: np.ndarray, **sources: float) -> Evaluation:
+        """Return -2 ln L at the unknowns, with its derivatives.
+
+        Args:
+            flat: the unknowns, in their unconstrained scale.
+            sources: factors of variances, see `jaxgran.fitting.prediction.PredictedCurve`.
+        """
+        key = flat.tobytes() + repr(sources).encode()
+        if key not in self._last:
+            self._last.clear()
+            self._last[key] = self._evaluate(flat, sources)
+        return self._last[key]
+
+    def _evaluate(self, flat: np.ndarray, sources: dict[str, float]) -> Evaluation:
+        values = self.values(flat)
+        elements = self.elements(flat)
+        rows: list[Residuals] = []
+        curves: dict[str, dict[str, Any]] = {}
+
+        def add(name: str, label: str | None, row: Any, slopes: Any, is_prior: bool = True) -> None:
+            rows.append(_of_unit_variance(name, label, row, slopes, elements, is_prior))
+
+        for m in self.measurements:
+            own = values[m.label]
+            if isinstance(m, DropRows):
+                floats = {n: jnp.asarray(x) for n, x in own.items() if n in m.gas.domains}
+                row, slopes = residuals_and_slopes(m.data.residuals, m.gas, floats)
+                widening = np.hypot(1.0, own.get("spread", 0.0) / np.asarray(m.data.error))
+                slopes = {name: x / widening[:, None] for name, x in slopes.items()}
+                add("drop test", m.label, row / widening, slopes, is_prior=False)
+                rows[-1] = rows[-1]._replace(log_variance=2 * np.log(widening))
+                continue
+            applied = [e for e in elements if e.label in (None, m.label)]
+            curve = predicted_curve(m, self._simplified_model, own, applied, self.tolerance)
+            rows += curve.residuals(len(elements), **sources)
+            curves[m.label] = curve.fields
+            for name, error in m.nuisances.items():
+                row = np.atleast_1d(own[name]) / error
+                add(name, m.label, row, {name: np.ones((1, 1)) / error})
+        for label, priors in self.priors.items():
+            at = label or self.measurements[0].label
+            gas = next(m.gas for m in self.measurements if m.label == at)
+            for name, (row, slopes) in prior_residuals(priors, gas, values[at]).items():
+                add(name, label or None, row, slopes)
+        return summed(rows, curves)
+
+
+def _of_unit_variance(
+    name: str,
+    label: str | None,
+    values: Any,
+    slopes: dict[str, Any],
+    elements: list[Element],
+    is_prior: bool,
+) -> Residuals:
+    """Return residuals of known variance, from their derivatives in SI values by parameter."""
+    values = np.asarray(values, float)
+    matrix = np.zeros((values.size, len(elements)))
+    for e in elements:
+        applies = label is None or e.label in (None, label)
+        if applies and e.name in slopes:
+            matrix[:, e.place] = np.asarray(slopes[e.name])[:, e.number] * e.slope
+    nothing = np.zeros(values.size)
+    return Residuals(name, label, values, matrix, nothing, np.zeros_like(matrix), is_prior)
+
+
+def summed(rows: list[Residuals], curves: dict[str, dict[str, Any]]) -> Evaluation:
+    """Return -2 ln L of independent residuals, with its derivatives."""
+    value = 0.0
+    size = rows[0].slopes.shape[1]
+    gradient = np.zeros(size)
+    information = np.zeros((size, size))
+    for row in rows:
+        value += float(np.sum(row.values**2) + np.sum(row.log_variance))
+        gradient += 2 * row.values @ row.slopes + (1 - row.values**2) @ row.log_slopes
+        information += row.information
+    return Evaluation(value, gradient, information, rows, curves)

@@ -1,0 +1,454 @@
+"""Measured curves and drop tests as a fit compares them with a model."""
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxgran._utils.tracing import grid_size
+from jaxgran._utils.validation import float_array
+from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.drop_test import DropTest
+from jaxgran.data.measurement import Measurement
+from jaxgran.models.base import AbstractModel
+from jaxgran.models.choose import error_model_along
+from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.models.linearise import (
+    curve_of_program,
+    with_neutral_elements,
+    with_variant_law,
+)
+from jaxgran.scene.gas import Gas
+
+SCATTER = "scatter of N"
+"""Nuisance parameter: the logarithm of the scatter of N grains over what theory gives."""
+
+ROTATION = "model of T_rot"
+"""Nuisance parameter: the logarithm of a common factor of all T_rot, over theory's accuracy."""
+
+DISPLACEMENT = "model of <dr^2>"
+"""The same of the diffusive part of <dr^2>."""
+
+MAX_LOG_STEP = 0.25
+"""Longest step between two times at which a curve is computed, in ln(1 + t/tau_c): T falls by .4 in
+its logarithm."""
+
+TINY = float(np.finfo(np.float32).tiny)
+
+CALIBRATION = "calibration"
+"""The logarithm of a common factor of all measured T and T_rot."""
+
+WEAK_SCATTER = 1.5
+"""Standard error of ln N where N is not known. Far fewer grains than `UNKNOWN_NUMBER` are a misfit;
+more may be any number."""
+
+UNKNOWN_NUMBER = 1e3
+"""N about which it is searched then."""
+
+SCATTER_ERROR = 0.05
+"""Relative error of the variance that theory gives to a run of N grains."""
+
+ERRORS_OF_PARTICLES = 0.1
+"""Relative difference up to which T_err is taken for the fluctuation of independent samples."""
+
+
+class Observed(NamedTuple):
+    """Measured values at the nodes: T in the first column and T_rot in the second.
+
+    All arrays have the shape (nodes, 2).
+
+    Attributes:
+        values: m^2/s^2; any value where nothing was measured.
+        errors: standard errors of the measurement, m^2/s^2, 0 where there is none.
+        used: 1 where a value counts, 0 elsewhere.
+        simulation: variances of the computed ln T and ln T_rot by simulations.
+    """
+
+    values: Any
+    errors: Any
+    used: Any
+    simulation: Any
+
+
+class Noise(NamedTuple):
+    """What makes the measured values scatter about theory, apart from their own errors.
+
+    Attributes:
+        scatter: 1/N of all runs together, times a factor that a fit may vary.
+        first: variance of ln T at t = 0 over `scatter`: 0 where T_0 is the run's own.
+        rate_error: relative standard error of theory's cooling rate at the nodes, shape (nodes,).
+        sample: variance of ln T by the sampling of some of the grains.
+        white: relative standard deviation of further errors, independent at each time.
+    """
+
+    scatter: Any
+    first: Any
+    rate_error: Any
+    sample: Any
+    white: Any
+
+
+class Displacement(NamedTuple):
+    """A measured <dr^2>.
+
+    Attributes:
+        values: m^2.
+        errors: relative standard errors, with the accuracy of the model at each time; 0 where a
+            value does not count.
+        accuracy: relative accuracy of the model, which applies to a common factor, too.
+    """
+
+    values: Float[np.ndarray, "times"]
+    errors: Float[np.ndarray, "times"]
+    accuracy: float
+
+
+@dataclass(frozen=True)
+class CurveRows:
+    """A measured curve, to be compared with a model.
+
+    Attributes:
+        label: in a fit of several measurements, otherwise "".
+        measurement: the measured curve and its scene.
+        gas: the scene with all elements that the model supports.
+        values: measured T and T_rot, m^2/s^2, shape (times, 2).
+        errors: their standard errors, with the rounding of the file; 0 where they have none.
+        used: 1 where a value counts, 0 elsewhere.
+        scatter: 1/N over all runs; where N is not known, a value about which it is searched.
+        scatter_error: standard error of the logarithm of the scatter.
+        faster: factor by which the measured gas cools faster because N is small.
+        unit_time: mean free time of the scene, s.
+        rate_error: times, s, and the relative error of the model's cooling rate at them.
+        rotation_accuracy: relative accuracy of the model's T_rot.
+        displacement: <dr^2>; None where it is not used.
+        offset: ln T and ln T_rot of the fitted model minus those of the model that is evaluated,
+            at the times of the data.
+        simulation: variances of ln T and ln T_rot by simulations, shape (times, 2).
+        sample: variance of ln T where some of the grains are tracked.
+        first: variance of ln T at t = 0 over the scatter: 0 where T_0 is the run's own.
+    """
+
+    label: str
+    measurement: Measurement
+    gas: Gas
+    values: Float[np.ndarray, "times 2"]
+    errors: Float[np.ndarray, "times 2"]
+    used: Float[np.ndarray, "times 2"]
+    scatter: float
+    scatter_error: float
+    faster: float
+    unit_time: float
+    rate_error: tuple[np.ndarray, np.ndarray]
+    rotation_accuracy: float = 0.0
+    displacement: Displacement | None = None
+    offset: np.ndarray | float = 0.0
+    simulation: np.ndarray | float = 0.0
+    sample: float = 0.0
+    first: float = 0.0
+
+    @property
+    def scene(self) -> Gas:
+        """The gas of the measurement."""
+        return self.measurement.gas
+
+    @property
+    def curve(self) -> CoolingCurve:
+        """The measured curve."""
+        return self.measurement.curve
+
+    @property
+    def num_points(self) -> int:
+        """Number of times at which T counts."""
+        return int(np.sum(self.used[:, 0]))
+
+    @property
+    def uses_rotation(self) -> bool:
+        """Whether T_rot is compared."""
+        return bool(np.any(self.used[:, 1]))
+
+    def at_nodes(self, count: int, place: np.ndarray, error_factor: float = 1.0) -> Observed:
+        """Return the measured values among the nodes of a computed curve.
+
+        Args:
+            count: number of nodes.
+            place: place of each time of the data among them.
+            error_factor: factor of the errors.
+        """
+
+        def among(values: Any, elsewhere: float) -> np.ndarray:
+            whole = np.full((count, 2), elsewhere)
+            whole[place] = values
+            return whole
+
+        return Observed(
+            among(self.values, 1.0),
+            error_factor * among(self.errors, 0.0),
+            among(self.used, 0.0),
+            among(self.simulation, 0.0),
+        )
+
+    def noise(
+        self, times: np.ndarray, scatter: Any, white: float = 0.0, model: float = 1.0
+    ) -> Noise:
+        """Return what makes the values scatter.
+
+        Args:
+            times: of the nodes, s.
+            scatter: 1/N of all runs, times a factor.
+            white: see `Noise`.
+            model: factor of the error of the cooling rate.
+        """
+        known, error = self.rate_error
+        rate_error = model * np.interp(times, known, error)
+        return Noise(
+            scatter, np.asarray(self.first), rate_error, np.asarray(self.sample), np.asarray(white)
+        )
+
+    @property
+    def nuisances(self) -> dict[str, float]:
+        """Its nuisance parameters, with their standard errors."""
+        errors = {SCATTER: self.scatter_error}
+        if self.measurement.calibration_error:
+            errors[CALIBRATION] = self.measurement.calibration_error
+        if self.uses_rotation:
+            errors[ROTATION] = self.rotation_accuracy
+        if self.displacement is not None:
+            errors[DISPLACEMENT] = self.displacement.accuracy
+        return errors
+
+
+@dataclass(frozen=True)
+class DropRows:
+    """A drop test of spheres of a gas, among the measurements of a fit."""
+
+    label: str
+    measurement: Measurement
+
+    @property
+    def gas(self) -> Gas:
+        """The gas of the spheres, with the law that alternative explanations change."""
+        return with_variant_law(self.measurement.gas)
+
+    @property
+    def scene(self) -> Gas:
+        """The gas that was measured."""
+        return self.measurement.gas
+
+    @property
+    def data(self) -> DropTest:
+        """The impacts."""
+        assert isinstance(self.measurement.data, DropTest)
+        return self.measurement.data
+
+    @property
+    def num_points(self) -> int:
+        """Number of impacts."""
+        return int(np.size(self.data.restitution))
+
+    @property
+    def nuisances(self) -> dict[str, float]:
+        """It has no nuisance parameters."""
+        return {}
+
+
+def curve_rows(
+    label: str, measurement: Measurement, model: AbstractModel, *, fits_T_0: bool, fits_t0: bool
+) -> tuple[CurveRows, list[str]]:
+    """Return a measured curve as it is compared with a model, and notes on its errors.
+
+    Args:
+        label: of the measurement.
+        measurement: of a curve.
+        model: without noise.
+        fits_T_0: whether T_0 is a free parameter.
+        fits_t0: whether the start of the clock is one; <dr^2>, which starts at t = 0 of the curve,
+            is not used then.
+    """
+    gas = measurement.gas
+    curve = measurement.curve
+    notes: list[str] = []
+    T = np.asarray(curve.temperature)
+    uses_rotation = gas.surface is not None and curve.rotational_temperature is not None
+    T_rot = np.asarray(curve.rotational_temperature) if uses_rotation else np.ones_like(T)
+    given = [curve.temperature_error, curve.rotational_temperature_error if uses_rotation else None]
+    components = [gas.dimension, 2 * gas.dimension - 3]
+    errors = np.stack(
+        [
+            _errors_of_measurement(name, measurement, x, values, degrees, notes)
+            for name, x, values, degrees in zip(
+                ("T_err", "T_rot_err"), given, (T, T_rot), components, strict=True
+            )
+        ],
+        axis=1,
+    )
+    for k, name in enumerate(("temperature", "rotational_temperature")):
+        digit = np.asarray(measurement.rounding.get(name, 0.0))
+        errors[:, k] = np.hypot(errors[:, k], digit / 12**0.5)
+    used = np.stack([np.ones(T.size), np.full(T.size, float(uses_rotation))], axis=1)
+    if np.asarray(curve.times)[0] == 0 and not _has_error_at_first(measurement):
+        used[0, 0] = float(fits_T_0)
+        used[0, 1] = 0.0
+    used[:, 1] *= T_rot > 0
+    N = measurement.num_particles
+    total = (UNKNOWN_NUMBER if N is None else N) * measurement.replicas
+    tracked = measurement.tracked
+    sample = 0.0
+    if tracked is not None:
+        sample = 2 / (gas.dimension * tracked) * (1 - (0 if N is None else tracked / N))
+    rows = CurveRows(
+        label,
+        measurement,
+        with_neutral_elements(gas, model),
+        np.stack([T, T_rot], axis=1),
+        errors,
+        used,
+        scatter=1 / total,
+        scatter_error=WEAK_SCATTER if N is None else SCATTER_ERROR,
+        faster=1.0 if N is None else float(finite_size_cooling_factor(gas, float_array(N))),
+        unit_time=float(gas.mean_free_time),
+        rate_error=(np.zeros(1), np.zeros(1)),
+        rotation_accuracy=float(model.rotation_accuracy(gas)) if uses_rotation else 0.0,
+        displacement=None if fits_t0 else _displacement(measurement, model, notes),
+        sample=sample,
+        first=2 / gas.dimension if measurement.ensemble_start and not fits_T_0 else 0.0,
+    )
+    return rows, notes
+
+
+def _has_error_at_first(measurement: Measurement) -> bool:
+    error = measurement.curve.temperature_error
+    return error is not None and measurement.replicas == 1 and float(error[0]) > 0
+
+
+def _errors_of_measurement(
+    name: str,
+    measurement: Measurement,
+    given: Any,
+    values: np.ndarray,
+    components: int,
+    notes: list[str],
+) -> np.ndarray:
+    """Return the standard errors of a measured quantity apart from the fluctuations of N grains.
+
+    The errors of a mean over runs are those of the grains, which the likelihood knows. So are
+    errors of one run that equal ``sqrt(2/(d N))`` of the values, the fluctuation of independent
+    samples of N grains; those of a sample of the grains are computed, too.
+    """
+    nothing = np.zeros_like(values)
+    if given is None or measurement.replicas > 1:
+        return nothing
+    error = np.asarray(given)
+    if measurement.errors_measured:
+        return error
+    if measurement.tracked is not None:
+        notes.append(f"{name} is not used: the sampling of {measurement.tracked} grains is known")
+        return nothing
+    N = measurement.num_particles
+    if N is not None:
+        ratio = error[error > 0] / (2 / (components * N)) ** 0.5 / values[error > 0]
+        if np.all(np.abs(ratio - 1) < ERRORS_OF_PARTICLES):
+            notes.append(
+                f"{name} is that of independent samples of {N} grains and is not used: the energy "
+                "of all grains of one run fluctuates less, as theory knows. If these are errors of "
+                "the measurement, say so: `errors: measured`"
+            )
+            return nothing
+    return error
+
+
+def _displacement(
+    measurement: Measurement, model: AbstractModel, notes: list[str]
+) -> Displacement | None:
+    """Return <dr^2> if it was measured with errors, or of N grains, and the model knows it."""
+    curve = measurement.curve
+    gas = measurement.gas
+    N = measurement.num_particles
+    if curve.displacement is None:
+        return None
+    accuracy = model.displacement_accuracy(gas)
+    if accuracy is None:
+        return None
+    values = np.asarray(curve.displacement)
+    if curve.displacement_error is None:
+        if N is None:
+            return None
+        relative = np.full(values.shape, (2 / (gas.dimension * N * measurement.replicas)) ** 0.5)
+    else:
+        relative = np.asarray(curve.displacement_error) / np.maximum(values, TINY)
+    used = (values > 0) & (relative > 0)
+    errors = np.where(used, np.hypot(relative, float(accuracy)), 0.0)
+    return Displacement(values, errors, float(accuracy))
+
+
+def unused_rotation(measurement: Measurement) -> str | None:
+    """Return why a fit ignores the T_rot of a curve; None if it uses it or if there is none."""
+    if measurement.curve.rotational_temperature is None or measurement.gas.surface is not None:
+        return None
+    return (
+        "the measured T_rot is not used: the gas has no surface=jaxgran.Rough(...) (header key "
+        "beta_t)"
+    )
+
+
+@eqx.filter_jit
+def finite_size_cooling_factor(gas: Gas, num_particles: ArrayLike) -> Float[Array, ""]:
+    """Factor by which N particles without total momentum cool faster than many, at the same T.
+
+    Their relative velocities are those of the temperature ``T' = T N/(N-1)``, and each particle
+    collides with N - 1 others: with ``-d ln T/dt = r(T)`` the factor is r(T')/r(T), here with the
+    loss ``1 - eps^2`` at the impact speed sqrt(2 T): 1 + .6/N for viscoelastic spheres, 1 + .5/N
+    for a constant eps. It is 1 between walls, which take up momentum.
+    """
+    if gas.container is not None:
+        return jnp.ones_like(gas.temperature)
+    hotter = jnp.sqrt(num_particles / jnp.maximum(num_particles - 1, 1.0))
+    one = jnp.ones_like(gas.temperature)
+    loss = 1 - gas.reduced_law.restitution(one) ** 2
+    ratio = (1 - gas.reduced_law.restitution(hotter * one) ** 2) / jnp.where(loss > 0, loss, 1.0)
+    return hotter * jnp.where(loss > 0, ratio, 1.0)
+
+
+def with_rate_error(rows: CurveRows, model: AbstractModel, gas: Gas) -> CurveRows:
+    """Return a curve with the error of a model's cooling rate in a gas.
+
+    Args:
+        rows: the measured curve.
+        model: of the fit; kinetic theory gives the curve on which the error of a stochastic one
+            depends.
+        gas: the scene, with values of the unknowns.
+    """
+    known = np.asarray(rows.curve.times) * rows.faster
+    times, _ = times_with_nodes(known, rows.unit_time)
+    exact = KineticTheory() if model.stochastic else model
+    curve = curve_of_program(exact, gas, times, rows.displacement is not None)
+    if not np.all(np.isfinite(np.asarray(curve.temperature))):
+        return rows
+    error_model = error_model_along(gas, curve, rows.measurement.num_particles)
+    error = np.broadcast_to(model.rate_error(error_model), times.shape)
+    return replace(rows, rate_error=(times, np.asarray(error, float)))
+
+
+def times_with_nodes(times: np.ndarray, mean_free_time: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return times from 0 on that contain those given, and the places of these.
+
+    Neighbours are at most `MAX_LOG_STEP` apart in ``ln(1 + t/tau_c)``. They are padded to a length
+    of the grid by repeating the last one.
+    """
+    order = np.argsort(times, kind="stable")
+    known = np.append(0.0, np.log1p(times[order] / mean_free_time))
+    # As many nodes between two times as if the first one were 0: not fewer with another t0.
+    since_first = np.log1p((times[order] - times[order[0]]) / mean_free_time)
+    lengths = np.append(known[1], np.diff(since_first))
+    parts = np.maximum(np.ceil(lengths / MAX_LOG_STEP).astype(int), 1)
+    steps = zip(known, known[1:], parts, strict=False)
+    merged = np.concatenate([[0.0], *(np.linspace(a, b, n + 1)[1:] for a, b, n in steps)])
+    at = np.cumsum(parts)
+    merged = np.expm1(merged) * mean_free_time
+    merged[at] = times[order]
+    place = np.empty(times.size, int)
+    place[order] = at
+    padding = grid_size(merged.size) - merged.size
+    return np.append(merged, np.full(padding, merged[-1])), place
