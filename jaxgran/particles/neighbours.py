@@ -249,11 +249,10 @@ class Pairs(NamedTuple):
     lookahead: Int[Array, ""]
 
 
-def wrap(side: ArrayLike, position: Any) -> Any:
-    """Move positions, arrays of JAX or NumPy, by multiples of the side into [0, side)."""
-    xp = np if isinstance(position, np.ndarray) else jnp
-    inside = xp.mod(position, side)
-    return xp.where(inside >= side, 0.0, inside)  # rounding may give exactly `side`
+def wrap(side: ArrayLike, position: Float[Array, "n d"]) -> Float[Array, "n d"]:
+    """Move positions by multiples of the side into [0, side)."""
+    inside = jnp.mod(position, side)
+    return jnp.where(inside >= side, 0.0, inside)  # rounding may give exactly `side`
 
 
 def choose_engine(name: str, ahead: int = 0, traced: bool = False) -> str:
