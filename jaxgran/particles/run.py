@@ -421,7 +421,8 @@ def over_groups(
 def _joined(x: np.ndarray, axis: int, groups: Groups) -> Array:
     """Return an array in which an axis of groups is joined with the next axis, of replicas."""
     kept = np.take(x, np.arange(groups.number), axis)
-    shape = *x.shape[:axis], -1, *x.shape[axis + 2 :]
+    joined = kept.shape[axis] * kept.shape[axis + 1]  # there may be no directions: not -1
+    shape = *x.shape[:axis], joined, *x.shape[axis + 2 :]
     return jnp.asarray(kept.reshape(shape))
 
 

@@ -244,3 +244,22 @@ def test_walls_a_fraction_of_a_mean_free_path_apart_are_met_by_the_fast_spheres_
     assert float(fine.temperature[-1] / gas.temperature) < 0.8
     # Impacts of 20 000 spheres on walls, some each: sqrt(1/20 000) of a loss of .2, .2 % of T.
     np.testing.assert_allclose(curve.temperature, fine.temperature, rtol=0.006)
+
+
+def test_a_derivative_in_the_density_is_one_in_the_times():
+    gas = glass_beads()
+    times = jnp.array([1.0, 3.0]) * gas.mean_free_time
+
+    def temperature(density, scale):
+        denser = gas.replace(packing_fraction=density)
+        return jaxgran.cool(denser, scale * times, model=DSMC(50)).temperature
+
+    def log_frequency(density):
+        return jnp.log(gas.replace(packing_fraction=density).collision_frequency)
+
+    # Neither is a direction in the numbers of the scene: tangents have no rows.
+    density = gas.packing_fraction
+    _, by_density = jax.jvp(lambda x: temperature(x, 1.0), (density,), (1.0,))
+    _, by_time = jax.jvp(lambda x: temperature(density, x), (1.0,), (1.0,))
+    assert np.all(by_time < 0)
+    np.testing.assert_allclose(by_density, jax.grad(log_frequency)(density) * by_time, rtol=1e-9)
