@@ -137,9 +137,9 @@ def run_traced(
     def reach(stages: Stages, state: Any) -> Any:
         """Move a state by the first process, whose arrays suffice for all stages."""
         process, _ = stages[0]
-        untils = jnp.stack([jnp.asarray(until) for _, until in stages])
+        ends = jnp.stack([jnp.asarray(until) for _, until in stages])
         return jax.lax.scan(
-            lambda state, until: (move(process, state, until), None), state, untils
+            lambda state, until: (move(process, state, until), None), state, ends
         )[0]
 
     fault = jnp.zeros((), jnp.int32)
