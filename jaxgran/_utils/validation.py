@@ -57,18 +57,19 @@ class Domain(NamedTuple):
             raise ValueError(
                 f"{name} must be a number in {self}, got {value!r}. {advice}"
             ) from None
-        wrong = ~np.asarray(self.contains(numbers))
+        wrong = ~self.contains(numbers)
         if np.any(wrong):
             raise ValueError(f"{name} must lie in {self}, got {numbers[wrong].flat[0]:g}. {advice}")
 
-    def contains(self, value: Any) -> Any:
+    def contains(self, value: ArrayLike) -> Any:
         """Tell for each element of a value whether it is finite and lies in the interval.
 
-        The value is a number or an array of JAX or NumPy, and may be traced.
+        The value may be traced. The result is an array of JAX if the value is, otherwise of NumPy.
         """
-        above = value >= self.low if self.low_allowed else value > self.low
-        below = value <= self.high if self.high_allowed else value < self.high
-        return above & below & (abs(value) < np.inf)
+        x: Any = value if isinstance(value, jax.Array) else np.asarray(value)
+        above = x >= self.low if self.low_allowed else x > self.low
+        below = x <= self.high if self.high_allowed else x < self.high
+        return above & below & (abs(x) < np.inf)
 
     def to_free(self, value: Any) -> Any:
         """Map the interior of the interval one-to-one onto the whole real line.
