@@ -138,9 +138,10 @@ def run_traced(
         """Move a state by the first process, whose arrays suffice for all stages."""
         process, _ = stages[0]
         ends = jnp.stack([jnp.asarray(until) for _, until in stages])
-        return jax.lax.scan(
+        reached, _ = jax.lax.scan(
             lambda state, until: (move(process, state, until), None), state, ends
-        )[0]
+        )
+        return reached
 
     fault = jnp.zeros((), jnp.int32)
     if start is None:
