@@ -28,6 +28,7 @@ import time
 from collections.abc import Iterator
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -143,8 +144,8 @@ def random_start(gas: jaxgran.Gas, size: int, replicas: int) -> jaxgran.Particle
     """Return disks at random places that do not overlap, not equilibrated."""
     model = HardSpheres(size, replicas=replicas)
     placement = model.dynamics(model.scene(gas), 2, replicas).placement()
-    state = jax.jit(placement.initial)(jax.random.key(0))
-    push = jax.jit(placement.advance)
+    state = eqx.filter_jit(placement.initial)(jax.random.key(0))
+    push = eqx.filter_jit(placement.advance)
     while placement.unfinished(state, jnp.zeros(())):
         state = push(state, jnp.zeros(()))
     assert int(state.status) == 0

@@ -3,6 +3,7 @@
 import dataclasses
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,7 +29,7 @@ def followed(gas, position, velocity, replicas, end, interval):
     start = jnp.asarray(position), jnp.asarray(velocity)
     directions = scene.material._replace(law=law)
     state = dynamics.initial(start, jax.random.key(0), directions)
-    advance = jax.jit(dynamics.advance)
+    advance = eqx.filter_jit(dynamics.advance)
     while dynamics.unfinished(state, jnp.asarray(end)):
         state = advance(state, end)
     assert int(state.status) == 0
