@@ -16,7 +16,7 @@ UNCHECKED = {
     "models.cool": {"cool"},
     "models.spheres": {"AbstractSpheres.sized_for"},
     "particles.observables": {"pair_correlation"},
-    "particles.setup": {"check_start"},
+    "particles.start": {"check_start"},
     "scene.elements": {"_wall_law"},
     "scene.gas": {"Gas.replace", "Gas.restitution", "_checked_law"},
     "scene.geometry": {"sphere_mass"},

@@ -82,12 +82,12 @@ class Case:
         gas = self.gas if gas is None else gas
         return gas.replace(**{self.parameter: gas.value(self.parameter) * jnp.exp(log_scale)})
 
-    def curve_and_slope(self, gas=None, times=None, start=None):
+    def curve_and_slope(self, gas=None, times=None, start=None, **options):
         """A curve and its derivative in the logarithm of the parameter."""
         start = self.start if start is None else start
 
         def of(log_scale):
-            return self.run(self.scaled(log_scale, gas), times, start)
+            return self.run(self.scaled(log_scale, gas), times, start, **options)
 
         return jax.jvp(of, (0.0,), (1.0,))
 
@@ -493,27 +493,38 @@ class TestContract:
         forward = jnp.sum(weights * case.reference[1].temperature)
         assert float(jax.grad(loss)(0.0)) == pytest.approx(float(forward), rel=1e-10)
 
-    @of_models()
+    @of_models(lambda case: not case.model.stochastic)
     def test_derivative_is_a_difference(self, case):
         h = 1e-3
-        at = [case.run(case.scaled(s * h), start=case.start) for s in (-1, 1)]
+        less, more = (case.run(case.scaled(s * h)) for s in (-1, 1))
         slope = case.reference[1]
-        exact = not case.model.stochastic
         for name in ("temperature", "displacement", "collisions"):
-            if (a := getattr(at[1], name)) is None or (name == "collisions" and not exact):
-                continue  # the number of collisions of a run is a step function
-            difference = (a - getattr(at[0], name)) / (2 * h)
-            # Projected derivatives keep the temperature of a gas alone, not each velocity.
-            last, tolerance = (4, 1e-5) if exact else (SHORT + 1, 0.15)
-            if name == "temperature" or exact:
-                size = float(jnp.max(jnp.abs(difference[:last])))
-                np.testing.assert_allclose(
-                    getattr(slope, name)[:last], difference[:last], atol=tolerance * size
-                )
-        if not exact:  # what projected derivatives do not know is nan
-            assert np.all(np.isnan(slope.sonine))
+            if (a := getattr(more, name)) is not None:
+                difference = (a - getattr(less, name)) / (2 * h)
+                size = float(jnp.max(jnp.abs(difference)))
+                np.testing.assert_allclose(getattr(slope, name), difference, atol=1e-5 * size)
+
+    @of_models(is_stochastic)
+    def test_projected_derivative_is_a_difference(self, case):
+        h, off = 1e-3, []
+        for key in jax.random.split(jax.random.key(3), 5):
+            start = None
             if case.model.has_positions:
-                assert np.all(np.isnan(slope.particles.velocity))
+                start = jax.tree.map(lambda x: x[0], case.run(key=key).saved)
+            less, more = (case.run(case.scaled(s * h), start=start, key=key) for s in (-1, 1))
+            _, slope = case.curve_and_slope(start=start, key=key)
+            difference = (more.temperature - less.temperature)[: SHORT + 1] / (2 * h)
+            error = jnp.max(jnp.abs(slope.temperature[: SHORT + 1] - difference))
+            off.append(float(error / jnp.max(jnp.abs(difference))))
+        # Projected derivatives keep the temperature of a gas alone, not each velocity: of 24 starts
+        # of soft spheres half were off by less than .07, a fifth by more than .15.
+        assert np.median(off) < 0.15, off
+        # What projected derivatives do not know is nan.
+        slope = case.reference[1]
+        assert np.all(np.isnan(slope.sonine)) and np.all(np.isnan(slope.velocity_correlation))
+        assert np.all(np.isnan(slope.displacement))
+        if case.model.has_positions:
+            assert np.all(np.isnan(slope.particles.velocity))
 
     @of_models(is_stochastic)
     def test_derivatives_agree_with_kinetic_theory(self, case):

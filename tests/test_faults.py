@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,9 +18,8 @@ import jaxgran
 from jaxgran import Run
 from jaxgran._utils import tracing
 from jaxgran.data import checkpoint
-from jaxgran.particles import dynamics as moving
 from jaxgran.particles import run as particle_run
-from jaxgran.particles.run import block_until_ready, in_thread, run_through_times
+from jaxgran.particles import spheres as moving
 from tests.beads import glass_beads, spheres
 
 GAS = glass_beads(0.3, packing_fraction=0.1)
@@ -92,20 +90,6 @@ def test_second_derivatives_are_refused(kind):
 # --- runs that stop ------------------------------------------------------------------------------
 
 
-class Standing:
-    """A state whose time does not advance."""
-
-    time = np.zeros(())
-
-
-def test_a_run_that_stands_still_ends():
-    state, records, fault = run_through_times(
-        Standing(), np.ones(1), lambda s, end: s, lambda s: {"temperature": jnp.ones(())}
-    )
-    assert "no longer advances" in jaxgran.explain_status(fault)
-    assert np.isnan(records["temperature"])
-
-
 @pytest.mark.slow
 def test_blocks_that_stand_still_end(monkeypatch):
     monkeypatch.setattr(moving, "MIN_FLIGHT", 1e9)  # no flight is long enough
@@ -115,33 +99,6 @@ def test_blocks_that_stand_still_end(monkeypatch):
     jax.clear_caches()
     assert "no longer advances" in jaxgran.explain_status(curve.status)
     assert np.isnan(curve.temperature[0])
-
-
-@jax.jit
-def some_seconds():
-    # Not of scalars: JAX does not return before such programs have ended.
-    return jax.lax.fori_loop(0, 3000, lambda i, x: 0.99 * x @ x, jnp.eye(300))
-
-
-@pytest.mark.parametrize(
-    "wait", [lambda: in_thread(lambda: time.sleep(20)), lambda: block_until_ready(some_seconds())]
-)
-def test_waiting_can_be_interrupted(wait):
-    some_seconds.lower().compile()
-
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    old = signal.signal(signal.SIGALRM, interrupt)
-    began = time.monotonic()
-    try:
-        signal.setitimer(signal.ITIMER_REAL, 0.3)
-        with pytest.raises(KeyboardInterrupt):
-            wait()
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, old)
-    assert time.monotonic() - began < 1.5
 
 
 @pytest.mark.slow
@@ -288,31 +245,29 @@ def test_what_tree_at_changed_is_checked():
 # --- limits --------------------------------------------------------------------------------------
 
 
-class Moving(NamedTuple):
-    time: jax.Array
-
-
 def test_a_termination_saves_the_run_and_then_ends_the_process(tmp_path, monkeypatch):
     ended = []
-    monkeypatch.setattr(checkpoint.signal, "raise_signal", ended.append)
+    calls = []
+    ready = particle_run.block_until_ready
     path = tmp_path / "run.ckpt"
-    times = np.asarray([0.4, 1.0])
+    times = TAU * np.asarray([1.0, 2.0, 3.0])
+    model = jaxgran.DSMC(200)
+    whole = cool(GAS, times, model=model)
 
-    def advance(state, end):
-        if 0.4 < state.time < 0.6:
+    def ready_and_terminated(tree):
+        calls.append(0)
+        if len(calls) == 3:
             os.kill(os.getpid(), signal.SIGTERM)
-        return Moving(state.time + 0.1)
+        return ready(tree)
 
-    def run(advance):
-        arguments = Moving(jnp.zeros(())), times, advance, lambda state: {"temperature": state.time}
-        return run_through_times(*arguments, path=path, progress=False)
-
-    with pytest.raises(KeyboardInterrupt), checkpoint.saved_at_termination(path):
-        run(advance)
+    monkeypatch.setattr(checkpoint.signal, "raise_signal", ended.append)
+    monkeypatch.setattr(particle_run, "block_until_ready", ready_and_terminated)
+    with pytest.raises(KeyboardInterrupt):
+        cool(GAS, times, model=model, checkpoint=path)
     assert ended == [signal.SIGTERM] and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-    steps = []
-    _, records, _ = run(lambda state, end: steps.append(0) or Moving(state.time + 0.1))
-    assert len(steps) < 7 and records["temperature"][-1] >= 1.0
+    calls = [0] * 3
+    resumed = cool(GAS, times, model=model, checkpoint=path)
+    np.testing.assert_array_equal(resumed.temperature, whole.temperature)
 
 
 def test_programs_are_dropped_before_the_limit_of_memory_maps(monkeypatch):

@@ -120,7 +120,7 @@ def draw_coefficients(states: list[dict]):
 
 
 def dsmc_order(options: Options):
-    gas, of = hard_beads(0.1, 0.6), Scheme.of
+    gas, of = hard_beads(0.1, 0.6), Scheme.build
     size, replicas = (1000, 2) if options.smoke else (400_000, 16)
     times = [float(gas.mean_free_time)]
 

@@ -28,6 +28,7 @@ import time
 from collections.abc import Iterator
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,7 +38,7 @@ from experiments.support.analysis import crossing
 from experiments.support.record import Options, alone, alternately, figures, run_parts, seconds
 from experiments.support.scenes import beads, cool, hard_beads, times_of, viscoelastic_like
 from jaxgran import DSMC, HardSpheres, SoftSpheres
-from jaxgran.particles.setup import host_positions, maxwellian_velocities
+from jaxgran.particles.start import maxwellian_velocities
 
 MODELS = {"hard-spheres": HardSpheres, "soft-spheres": SoftSpheres, "dsmc": DSMC}
 COOLING = {"soft-spheres": 25.0, "hard-spheres": 100.0, "dsmc": 500.0}
@@ -141,11 +142,17 @@ def two_replicas(name: str, size: int, repeats: int) -> dict:
 
 def random_start(gas: jaxgran.Gas, size: int, replicas: int) -> jaxgran.Particles:
     """Return disks at random places that do not overlap, not equilibrated."""
-    side, shape = gas.box_side(size), (replicas, size, 2)
-    places = host_positions(jax.random.key(0), side / gas.diameter, *shape)
-    velocity = maxwellian_velocities(jax.random.key(1), *shape) * jnp.sqrt(gas.temperature)
-    position = places * gas.diameter
-    return jaxgran.Particles(position.reshape(shape), velocity.reshape(shape), side)
+    model = HardSpheres(size, replicas=replicas)
+    placement = model.dynamics(model.scene(gas), 2, replicas).placement()
+    state = eqx.filter_jit(placement.initial)(jax.random.key(0))
+    push = eqx.filter_jit(placement.advance)
+    while placement.unfinished(state, jnp.zeros(())):
+        state = push(state, jnp.zeros(()))
+    assert int(state.status) == 0
+    shape = replicas, size, 2
+    velocity = maxwellian_velocities(jax.random.key(1), shape) * jnp.sqrt(gas.temperature)
+    position = state.position * gas.diameter
+    return jaxgran.Particles(position.reshape(shape), velocity.reshape(shape), gas.box_side(size))
 
 
 def short(gas: jaxgran.Gas, name: str, size: int, replicas: int) -> dict:

@@ -54,10 +54,9 @@ def in_compiled_code(*trees: Any) -> bool:
 
 def pad_to(values: Any, size: int) -> Array:
     """Pad an array to `size` rows by repeating its last row."""
-    xp = array_module(values)  # by JAX a program would be compiled for each length
-    values = xp.asarray(values)
-    repeated = xp.repeat(values[-1:], size - len(values), axis=0)
-    return as_jax_arrays(xp.concatenate([values, repeated]))
+    added = [(0, size - len(values)), *[(0, 0)] * (np.ndim(values) - 1)]
+    # By JAX a program would be compiled for each length.
+    return as_jax_arrays(array_module(values).pad(values, added, mode="edge"))
 
 
 def truncate_to(values: Array, size: int) -> Array:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Float
 
 UserNumber = ArrayLike | Sequence[float]
 """A number of a user, or a list or an array of numbers."""
@@ -58,21 +58,19 @@ class Domain(NamedTuple):
             raise ValueError(
                 f"{name} must be a number in {self}, got {value!r}. {advice}"
             ) from None
-        wrong = ~self._contains(numbers, np)
+        wrong = ~self.contains(numbers)
         if np.any(wrong):
             raise ValueError(f"{name} must lie in {self}, got {numbers[wrong].flat[0]:g}. {advice}")
 
-    def contains(self, value: ArrayLike) -> Bool[Array, "..."]:
+    def contains(self, value: ArrayLike) -> Any:
         """Tell for each element of a value whether it is finite and lies in the interval.
 
-        The value may be traced.
+        The value may be traced. The result is an array of JAX if the value is, otherwise of NumPy.
         """
-        return self._contains(jnp.asarray(value), jnp)
-
-    def _contains(self, value: Any, xp: Any) -> Any:
-        above = value >= self.low if self.low_allowed else value > self.low
-        below = value <= self.high if self.high_allowed else value < self.high
-        return above & below & xp.isfinite(value)
+        x: Any = value if isinstance(value, jax.Array) else np.asarray(value)
+        above = x >= self.low if self.low_allowed else x > self.low
+        below = x <= self.high if self.high_allowed else x < self.high
+        return above & below & (abs(x) < np.inf)
 
     def to_free(self, value: Any) -> Any:
         """Map the interior of the interval one-to-one onto the whole real line.

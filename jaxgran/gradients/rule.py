@@ -1,21 +1,8 @@
 """The rule of differentiation of a particle run, for forward and reverse mode.
 
 `differentiable` gives a run projected derivatives: the tangents of its records along directions in
-the material (`with_tangents`), and a change of clock for the density and the times.
-`first_order_only` refuses second derivatives, and `nan_tangent` marks unknown derivatives.
-
-`by_differences` replaces the projected derivatives by central differences of whole runs. A gas that
-clusters remembers more than its temperature, and a projected derivative is wrong where a flow and
-clusters determine how it cools. Differences of runs include all of this, at the cost of two more
-runs for each number of the material, and of noise: chaotic runs with the same start are independent
-after some collisions, and the standard error of ``d ln T/d ln A`` is ``s / (sqrt(2) h)`` if that of
-ln T is s. So the step h is large, and a change of variables keeps its nonlinear error small.
-
-A step changes the loss of energy in an impact by a factor of ``exp(+- h)``. With
-``L = ln(loss)`` and a number a of the material, ``a_+- = a + (exp(+- h) - 1) / (dL/da)``, and the
-derivative in a is ``dL/da (f_+ - f_-) / (L_+ - L_-)``. For T the difference is that of
-``g = ln(T^(-3/5) - 1)``, which is linear in L for as long as viscoelastic spheres obey Haff's law,
-``T = (1 + t/tau)^(-5/3)`` with ``1/tau`` as the loss: then the difference is exact for any h.
+the material, and a change of clock for the density and the times. `first_order_only` refuses second
+derivatives, and `nan_tangent` marks unknown derivatives.
 """
 
 from collections.abc import Callable
@@ -29,136 +16,121 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, DTypeLike, Float, Int, PRNGKeyArray
-
-from jaxgran._utils.tracing import any_traced
-from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
+from jaxtyping import Array, DTypeLike, Float, Int
 
 T = TypeVar("T")
 
 
-class Inputs(NamedTuple):
-    """Arguments that determine a run, in reduced units.
+class Records(NamedTuple):
+    """What is recorded of a state; for a run every array has a first axis of times.
 
     Attributes:
-        scene: the gas; it has a collision_frequency.
-        times: t at which to record.
-        start: positions and velocities given by the user; None for random ones.
-        key: of the random numbers; None for the default.
-        units: of the saved particle data, whose derivatives are not known.
+        values: by name, each of shape (replicas,).
+        rates: derivatives in time of the values whose derivatives are known, by name; empty if the
+            state has no tangents.
+        tangents: derivatives of the same values along the directions at a fixed time, by name, each
+            of shape (directions, replicas).
+        saved: tree of what the function of the user returns for each replica, arrays of shape
+            (replicas, ...); None without such a function.
     """
 
-    scene: Any
-    times: Float[Array, "times"]
-    start: tuple[Array, Array] | None
-    key: PRNGKeyArray | None
-    units: Any = None
+    values: dict[str, Array]
+    rates: dict[str, Array]
+    tangents: dict[str, Array]
+    saved: Any = None
 
 
-class Outputs(NamedTuple):
-    """Results of a run.
+class Result(NamedTuple):
+    """Result of a run.
 
     Attributes:
-        position, velocity: of all particles at the last time; None if they are not returned.
-        records: by name, each of shape (times, replicas); "saved" is a tree of arrays of shape
-            (times, replicas, ...).
+        records: of all times.
+        particles: positions, velocities and spins of all particles at the last time; None where
+            they have no positions.
         status: of the run, see `jaxgran._utils.status`.
-        spin: of all particles at the last time; None for smooth spheres.
     """
 
-    position: Any
-    velocity: Any
-    records: dict[str, Any]
+    records: Records
+    particles: Any
     status: Int[Array, ""]
-    spin: Float[Array, "n spins"] | None = None
+
+
+BY_DENSITY = {"elastic_energy": 1.0}
+"""Power of the collision frequency in a record at a fixed place in the sequence of collisions; 0
+for all others."""
 
 
 def differentiable(
-    run: Callable[..., Outputs],
-    material: Callable[[Any], Any] = lambda scene: scene.material,
-    frequency: Callable[[Any], Any] = lambda scene: scene.collision_frequency,
-    non_differentiable: Callable[[Any], Any] = lambda scene: (),
-) -> Callable[[Inputs], Outputs]:
+    run: Callable[..., Result],
+    material: Callable[[Any], Any],
+    frequency: Callable[[Any], Any],
+    refused: Callable[[Any], dict[str, Any]] = lambda scene: {},
+) -> Callable[..., Result]:
     """Return a run with projected derivatives: one linear rule for forward and reverse mode.
 
     A gas depends on its material, its collision frequency and the times of the records. Tangents
     give the derivatives in the material; a change of the other two is a change of clock.
 
     Args:
-        run: a function of inputs, and of `directions` in the material: a pytree like the material,
-            whose leaves hold the directions along a first axis. With directions the records of the
-            run x are joined by their derivatives: "x.rate" in time and "x.along" in the directions,
-            as `with_tangents` returns them. Without both the derivatives of x are not known.
+        run: a function of the scene, the times, a given start and all else, such as the key of the
+            random numbers, and of `directions` in the material: a pytree like the material, whose
+            leaves hold the directions along a first axis. With directions its records have rates
+            and tangents.
         material: the pytree of parameters of a scene, such as (alpha, A) or a reduced law.
         frequency: the collision frequency of a scene; None if it is not part of the scene.
-        non_differentiable: the parameters of a scene in which the derivative is not known.
+        refused: the parameters of a scene in which the derivative is not known, by a message.
 
     Returns:
-        The run as a function of its inputs. Derivatives in positions and velocities of a start and
-        in `non_differentiable` parameters, and second derivatives, raise ValueError; derivatives of
-        a_2 and of the last particles are nan.
+        The run as a function of the same arguments. Derivatives in positions and velocities of a
+        start, in `refused` parameters, and second derivatives, raise ValueError. Derivatives of
+        the last particles and of records without rates are nan.
     """
 
     @jax.custom_jvp
-    def outputs(inputs: Inputs) -> Outputs:
-        out = run(inputs)
-        return out._replace(records=_plain(out.records))
+    def result(scene: Any, times: Array, start: Any, others: Any) -> Result:
+        return run(scene, times, start, others)
 
-    @partial(outputs.defjvp, symbolic_zeros=True)
-    def outputs_jvp(primals: tuple[Inputs], tangents: tuple[Inputs]):
-        (inputs,), (change,) = primals, tangents
-        if _changes(change.start):
+    @partial(result.defjvp, symbolic_zeros=True)
+    def result_jvp(primals: tuple, tangents: tuple) -> tuple[Result, Result]:
+        scene, times, start, others = first_order_only(primals)
+        scene_change, times_change, start_change, _ = tangents
+        if _changes(start_change):
             raise ValueError(
                 "the derivative in the positions or velocities of a start is not available: chaos "
                 "destroys it after a few collisions. Hold the start fixed with "
                 "jax.lax.stop_gradient, or for a short run use SoftSpheres(projection=None)"
             )
-        if _changes(non_differentiable(change.scene)):
-            raise ValueError(
-                "the derivative in the side of a container, or in the diameter or packing_fraction "
-                "of the gas in it, is not known. Hold them fixed with jax.lax.stop_gradient, take "
-                "differences of runs, or use KineticTheory()"
-            )
-        inputs = first_order_only(inputs)
-        directions, amounts = _directions(
-            material(inputs.scene), material(change.scene), inputs.times.dtype
-        )
-        out = run(inputs, directions=directions)
+        for message, numbers in refused(scene_change).items():
+            if _changes(numbers):
+                raise ValueError(message)
+        directions, amounts = _directions(material(scene), material(scene_change), times.dtype)
+        found = run(scene, times, start, others, directions)
         # In a gas that is denser by some share everything happens earlier by this share.
-        zero = jnp.zeros((), inputs.times.dtype)
-        rate, times = frequency(change.scene), change.times
-        density_change = rate / frequency(inputs.scene) if _changes(rate) else zero
-        time_change = (times if _changes(times) else zero) + inputs.times * density_change
+        zero = jnp.zeros((), times.dtype)
+        rate = frequency(scene_change)
+        density_change = rate / frequency(scene) if _changes(rate) else zero
+        delay = times_change if _changes(times_change) else zero
+        time_change = delay + times * density_change
+        records = found.records
+        known = {}
+        for name, rate in records.rates.items():
+            power = BY_DENSITY.get(name, 0.0)
+            by_clock = rate * time_change[:, None]
+            by_density = power * density_change * records.values[name]
+            along = jnp.einsum("tpr,p->tr", records.tangents[name], amounts)
+            known[name] = by_clock + by_density + along
+        plain = found._replace(records=records._replace(rates={}, tangents={}))
         changes = amounts, density_change, time_change
-        along, plain = {}, _plain(out.records)
-        for name in [name for name in plain if f"{name}.rate" in out.records]:
-            along[name] = out.records[f"{name}.rate"] * time_change[:, None]
-            along[name] += _DENSITY_POWER.get(name, 0.0) * density_change * plain[name]
-            if (directional := out.records.get(f"{name}.along")) is None:
-                along[name] += nan_tangent(along[name], *changes[:2])
-            else:
-                along[name] += jnp.einsum("tpr,p->tr", directional, amounts)
-        if "dissipated_energy" in along:  # the energy balance holds in the tangents, too
-            d = out.velocity.shape[1]
-            inside = along.get("elastic_energy", 0.0)
-            if "rotational_temperature" in along:
-                inside = inside + 0.5 * NUM_SPIN_COMPONENTS[d] * along["rotational_temperature"]
-            along["dissipated_energy"] = -0.5 * d * along["temperature"] - inside
-        out = out._replace(records=plain)
-        unknown = jax.tree.map(lambda x: nan_tangent(x, *changes), out)
-        return out, unknown._replace(records=unknown.records | along)
+        unknown = jax.tree.map(lambda x: nan_tangent(x, *changes), plain)
+        values = unknown.records.values | known
+        return plain, unknown._replace(records=unknown.records._replace(values=values))
 
-    return outputs
+    return result
 
 
 def _changes(tangents: Any) -> bool:
     leaves = jax.tree.leaves(tangents, is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
     return not all(isinstance(leaf, SymbolicZero) for leaf in leaves)
-
-
-def _plain(records: dict[str, Array]) -> dict[str, Array]:
-    """The records without the derivatives that `with_tangents` adds."""
-    return {name: x for name, x in records.items() if "." not in name}
 
 
 def _directions(
@@ -183,41 +155,6 @@ def _directions(
         for x, followed in zip(leaves, changing, strict=True)
     ]
     return structure.unflatten(directions), amounts
-
-
-UNKNOWN = {"sonine", "flow_share"}
-"""Records whose derivatives `with_tangents` does not know."""
-
-_DENSITY_POWER = {"displacement": -2.0, "elastic_energy": 1.0}
-"""Power of the collision frequency in a record at a fixed place in the sequence of collisions."""
-
-
-def with_tangents(
-    records: dict[str, Array],
-    along: dict[str, Array],
-    rates: dict[str, Array],
-    clock: Float[Array, "p replicas"],
-) -> dict[str, Array]:
-    """Return the records, and for each record x but `UNKNOWN` ones "x.rate" and "x.along".
-
-    The first is the derivative in time, the second the derivatives along the directions at a fixed
-    time.
-
-    Args:
-        records: each of shape (replicas,).
-        along: derivatives along the directions at a fixed place in the sequence of collisions;
-            0 for records that it lacks.
-        rates: derivatives in time; 0 for records that it lacks.
-        clock: tangent of the clock.
-    """
-    extended = dict(records)
-    for name, values in records.items():
-        if name in UNKNOWN:
-            continue
-        rate = rates.get(name, jnp.zeros(values.shape, clock.dtype))
-        extended[f"{name}.rate"] = rate
-        extended[f"{name}.along"] = along.get(name, 0.0) - rate[None] * clock
-    return extended
 
 
 def first_order_only(inputs: T) -> T:
@@ -275,87 +212,3 @@ def _nan_unless_zero(x: Float[Array, "..."]) -> Float[Array, "..."]:
         return jnp.where(x == 0, jnp.zeros_like(x), jnp.nan)
 
     return jax.lax.custom_linear_solve(lambda y: 0 * y, x, solution, solution)
-
-
-HAFF_EXPONENT = 0.6
-"""3/5, the power of ``T^(-3/5)``, which is linear in time by Haff's law of viscoelastic spheres."""
-
-
-def by_differences(
-    run: Callable[..., Outputs], shifted: Callable[[Inputs], Outputs], step: float
-) -> Callable[..., Outputs]:
-    """Return a run with directions, as `differentiable` takes it, by differences of whole runs.
-
-    Args:
-        run: a function of inputs and `directions`, which returns the derivatives in time even for
-            zero directions. The scene of its inputs is a named tuple with a `material`,
-            and has `log_loss` of a material.
-        shifted: a function of inputs, for the further runs.
-        step: h.
-    """
-
-    def outputs(inputs: Inputs, directions: Any = None) -> Outputs:
-        if directions is None:
-            return run(inputs)
-        none = jax.tree.map(lambda x: x[:0], directions)
-        if not any(len(leaf) for leaf in jax.tree.leaves(directions)):
-            return run(inputs, directions=none)  # only times or the density change
-        scene, material, traced = inputs.scene, inputs.scene.material, any_traced(inputs)
-        slope = jax.vmap(lambda along: jax.jvp(scene.log_loss, (material,), (along,))[1])(
-            directions
-        )
-        if not any_traced(slope) and not bool(jnp.all(jnp.isfinite(slope))):
-            raise ValueError(
-                "a derivative by differences changes the loss of an impact by a factor, but this "
-                "gas has no loss. Give it one, or leave differences out for projected derivatives"
-            )
-        # A number on which the loss does not depend changes nothing.
-        known = jnp.isfinite(slope) & (slope != 0)
-        signs = jnp.expm1(jnp.array([step, -step], slope.dtype))
-        sizes = jnp.where(known[:, None], signs[None] / jnp.where(known, slope, 1.0)[:, None], 0.0)
-
-        def end(size: Array, along: Any) -> Any:
-            return jax.tree.map(lambda number, along: number + size * along, material, along)
-
-        ends = jax.vmap(jax.vmap(end, (0, None)))(sizes, directions)
-        losses = jax.vmap(jax.vmap(scene.log_loss))(ends)
-        span = losses[:, 0] - losses[:, 1]
-        share = jnp.where(slope == 0, 0.0, slope / jnp.where(span == 0, jnp.nan, span))
-
-        def run_at(material: Any) -> tuple[dict[str, Array], Array]:
-            other = shifted(inputs._replace(scene=scene._replace(material=material)))
-            return other.records, other.status
-
-        out = run(inputs, directions=none)
-        ends = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), ends)
-        if traced:  # compiled once, or called from the host one by one
-            shifted_records, status = jax.lax.map(run_at, ends)
-        else:
-            each = [run_at(jax.tree.map(lambda x, i=i: x[i], ends)) for i in range(sizes.size)]
-            shifted_records, status = jax.tree.map(lambda *x: jnp.stack(x), *each)
-        records = dict(out.records)
-        for name, values in shifted_records.items():
-            if f"{name}.along" in records:
-                upper, lower = jnp.moveaxis(values.reshape(-1, 2, *values.shape[1:]), 1, 0)
-                change = _record_difference(name, records[name][None], upper, lower)
-                change = jnp.where(share[:, None, None] == 0, 0.0, share[:, None, None] * change)
-                records[f"{name}.along"] = jnp.moveaxis(change, 0, 1)
-        return out._replace(records=records, status=out.status | jnp.bitwise_or.reduce(status))
-
-    return outputs
-
-
-def _record_difference(name: str, base: Array, upper: Array, lower: Array) -> Array:
-    """Difference of a record between two ends; that of T in the variable g."""
-    plain = upper - lower
-    if name != "temperature":
-        return plain
-    below = (base < 1) & (upper < 1) & (lower < 1)
-
-    def g(T: Array) -> Array:
-        T = jnp.where(below, T, 0.5)
-        return jnp.log(jnp.expm1(-HAFF_EXPONENT * jnp.log(T)))
-
-    slope = base / HAFF_EXPONENT * jnp.expm1(HAFF_EXPONENT * jnp.log(jnp.where(below, base, 0.5)))
-    by_g = slope * (g(upper) - g(lower))
-    return jnp.where(below, by_g, plain)

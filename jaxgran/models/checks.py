@@ -14,12 +14,10 @@ from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced, is_known, known_part
 from jaxgran.data.curve import CoolingCurve, Run
 from jaxgran.models.base import AbstractModel, Limitation
-from jaxgran.particles.run import MIN_BOX
-from jaxgran.particles.setup import PACKING_LIMIT
 from jaxgran.particles.snapshot import nan_where
 from jaxgran.scene.elements import VOLUME_TOLERANCE, container_volume_ratio
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.geometry import NODES
+from jaxgran.scene.geometry import MIN_BOX, NODES, PACKING_LIMIT
 from jaxgran.theory.averages import impact_moments
 from jaxgran.theory.equations import max_thermal_speed, softness_factor
 
@@ -105,7 +103,8 @@ def first_cooling_rate(gas: Gas) -> tuple[Float[Array, ""], Float[Array, ""]]:
 
     The rate is negative if the law heats the gas; eps is that at speeds to `MAX_CHECKED_SPEED`.
     """
-    one, law = jnp.ones_like(gas.temperature), gas.reduced_law
+    one = jnp.ones_like(gas.temperature)
+    law = gas.reduced_law
     mu_2 = impact_moments(law, one, gas.dimension)[0, 0]
     speeds = jnp.asarray(NODES[NODES < MAX_CHECKED_SPEED], one.dtype)
     rate = 2 / gas.dimension * mu_2 * gas.impact_speed / gas.path_length
@@ -164,7 +163,8 @@ def check_volume(gas: Gas, num_particles: int) -> None:
     walls = gas.container
     if walls is None or any_traced(walls.side, gas.packing_fraction, gas.diameter):
         return
-    phi, share = float(gas.packing_fraction), container_volume_ratio(gas, num_particles)
+    phi = float(gas.packing_fraction)
+    share = container_volume_ratio(gas, num_particles)
     if abs(share - 1) > VOLUME_TOLERANCE:
         ways = [f"enlarge the container {share:.4g} times"] if share > 1 else []
         if gas.domains["packing_fraction"].contains(phi * share):
@@ -220,7 +220,8 @@ def limitations_of_homogeneity(gas: Gas, num_particles: int | None) -> tuple[Lim
         num_particles: N of the gas, which determines its box; None if unknown.
     """
     effects = []
-    phi, limit = float(gas.packing_fraction), CORRELATED_PACKING[gas.dimension]
+    phi = float(gas.packing_fraction)
+    limit = CORRELATED_PACKING[gas.dimension]
     if phi > limit:
         effects.append(
             f"the packing fraction {phi:.2g} is above {limit:g}, where successive collisions are "
@@ -235,7 +236,8 @@ def limitations_of_homogeneity(gas: Gas, num_particles: int | None) -> tuple[Lim
             )
     elif num_particles is not None:
         diameter = float(gas.diameter)
-        box, critical = float(gas.box_side(num_particles)), float(_contact_and_box(gas)[2])
+        box = float(gas.box_side(num_particles))
+        critical = float(_contact_and_box(gas)[2])
         if box > critical:
             effects.append(
                 f"the box, {box / diameter:.3g} diameters, is above "
@@ -349,7 +351,8 @@ def check_packing(gas: Gas, num_particles: int, random: bool) -> None:
     """Raise ValueError if the gas is too dense for a random start, or the box too small."""
     if isinstance(gas.packing_fraction, Tracer) or isinstance(gas.diameter, Tracer):
         return
-    limit, phi = PACKING_LIMIT[gas.dimension], float(jnp.max(gas.packing_fraction))
+    limit = PACKING_LIMIT[gas.dimension]
+    phi = float(jnp.max(gas.packing_fraction))
     if phi > limit and random:
         raise ValueError(
             f"packing_fraction {phi:.3g} is too dense for a fluid start, at most {limit:g} is "

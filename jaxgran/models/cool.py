@@ -42,8 +42,8 @@ def cool(
     The model is a description; `key`, `progress`, `checkpoint` and `throw` are options of this run.
     With known numbers a particle model is run from the host, which enlarges arrays that are too
     small, shows progress and writes checkpoints. Inside `jax.jit`, `jax.vmap` or a derivative this
-    is a pure function of arrays, which calls nothing on the host; a random start is then another
-    sample of the same distribution.
+    is a pure function of arrays, which calls nothing on the host. A key gives the same random start
+    in both, but for rounding, which the ten collisions of its equilibration enlarge.
 
     Args:
         gas: the scene; its floats may be traced, differentiated and batched with `jax.vmap`.
@@ -53,14 +53,14 @@ def cool(
             with the reasons.
         key: key of the random numbers of a particle model, by default `jax.random.key(0)`: two
             calls without a key return the same numbers. With several CPU devices, or from 8192
-            spheres on with one, each replica is a separate run with the key ``fold_in(key, k)``,
-            independent of the number of devices. Otherwise replicas share one array, and replicas
-            of spheres share their step lengths and the lifetimes of their neighbour lists.
+            spheres on with one, each replica has arrays of its own and the key
+            ``fold_in(key, k)``, independent of the number of devices. Otherwise replicas share one
+            array, and replicas of spheres share their step lengths and the lifetimes of their
+            neighbour lists.
         progress: show a progress bar on a terminal during a run of some seconds.
         checkpoint: path of a file for particle models. The run is saved there each minute and when
             it is interrupted, by Ctrl-C or SIGTERM, and is resumed from it; a resumed run gives the
-            same numbers bit for bit. Replicas that are separate runs write one file each, with the
-            suffixes .0, .1, ... Not inside `jax.jit` and `jax.vmap`.
+            same numbers bit for bit. Not inside `jax.jit` and `jax.vmap`.
         save: function for models with particles, which JAX can compile. It takes the `Particles` of
             one replica (arrays of shape (N, d), SI) and returns a pytree of arrays; see
             `jaxgran.observables`. Its mean over replicas at each time is ``curve.saved``, its
@@ -92,7 +92,9 @@ def cool(
     >>> [round(float(T), 5) for T in curve.temperature]
     [0.00784, 0.00524, 0.00205, 0.00053]
     """
-    gas, times, key = checks.checked_gas(gas), checked_times(times), checks.checked_key(key)
+    gas = checks.checked_gas(gas)
+    times = checked_times(times)
+    key = checks.checked_key(key)
     check_bool(progress=progress, throw=throw)
     model = KineticTheory() if model is None else model
     if model == "auto":

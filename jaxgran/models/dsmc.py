@@ -2,24 +2,22 @@
 
 from collections.abc import Callable
 from math import hypot
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxgran._utils.validation import Domain, checked_float, checked_int, python_int
-from jaxgran.data.curve import Run
-from jaxgran.gradients.rule import Inputs, Outputs, differentiable
+from jaxgran.gradients.rule import Result, differentiable
 from jaxgran.models import checks
 from jaxgran.models.base import Limitation
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.models.particle_model import AbstractParticleModel
-from jaxgran.particles.dsmc.collisions import DSMCDynamics, Scheme
-from jaxgran.particles.dsmc.run import run_dsmc
+from jaxgran.particles.dsmc.collisions import Scheme
+from jaxgran.particles.dsmc.dynamics import DSMCDynamics
 from jaxgran.particles.snapshot import Units
-from jaxgran.particles.state import transformed_times
-from jaxgran.scene.gas import Gas, reduced_scene
+from jaxgran.scene.gas import Gas, ReducedScene, reduced_scene
 
 MAX_STEP = 0.1
 """Largest number of collisions per particle and step: a step draws a particle at most twice."""
@@ -43,18 +41,14 @@ class DSMC(AbstractParticleModel):
     Supports all elements of a scene but `jaxgran.Frictional`: rough spheres; walls, which all
     particles of the homogeneous gas hit with the same probability, more often the more energy the
     walls take (`jaxgran.scene.elements`); drag, exactly, by collisions in transformed time
-    (`jaxgran.particles.state`), up to gamma t = 18 (8 in float32); a drive, with half of the kicks
-    at the beginning of each step and half at its end, on subsets of the particles in turn
-    (`jaxgran.particles.dsmc.collisions`). With elements the derivatives of T, T_rot and
-    collisions are known (`jaxgran.gradients.tangents`), others are nan.
+    (`jaxgran.particles.elements`), up to gamma t = 18 (8 in float32); a drive, with half of the
+    kicks at the beginning of each step and half at its end, on subsets of the particles in turn
+    (`jaxgran.particles.dsmc.dynamics`).
 
-    The curve is differentiable in every float of the gas and in the times, forward and reverse.
-    The derivatives are estimates. They are taken at a fixed scaled time s (``ds = sqrt(T) dt``, so
-    that the order of collisions does not depend on the speeds). The gas is assumed to remember its
-    temperature only; <dr^2> and the velocity correlation are assumed to change by the first Sonine
-    order of diffusion. The derivative of a_2 in a float of the gas is not known, and is nan. Rates
-    of change with time are those of the Maxwell-Sonine distribution. Second derivatives are
-    refused.
+    Derivatives of T, T_rot and collisions are known in every float of the gas and in the times,
+    forward and reverse. The gas is assumed to remember its energies only, of translation and of
+    rotation, whose tangents grow by what each collision, walls, drag and a drive exchange
+    (`jaxgran.gradients.tangents`). All other derivatives are nan. Second derivatives are refused.
 
     Args:
         num_particles: N, >= 2, on one device.
@@ -78,6 +72,8 @@ class DSMC(AbstractParticleModel):
     replicas: int = eqx.field(static=True, converter=python_int, default=1)
     step: float = eqx.field(static=True, default=0.05)
 
+    start: ClassVar[None] = None
+    transforms_time: ClassVar[bool] = True
     elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag", "drive")
     derivative_accuracy: ClassVar[float] = 0.01
 
@@ -86,6 +82,11 @@ class DSMC(AbstractParticleModel):
         checked_int("replicas", self.replicas, 1)
         allowed = Domain(0.0, MAX_STEP, high_allowed=True)
         checked_float("step", self.step, allowed, "A particle collides at most twice in a step.")
+
+    @property
+    def projected(self) -> bool:
+        """True: derivatives are projected."""
+        return True
 
     def check(self, gas: Gas) -> None:
         """Raise ValueError if the law of restitution heats the gas."""
@@ -105,24 +106,27 @@ class DSMC(AbstractParticleModel):
         contacts = checks.limitations_of_instant_impacts(gas)
         return contacts + checks.limitations_of_homogeneity(gas, num_particles)
 
-    def inputs(self, gas: Gas, times: Float[Array, "times"], run: Run) -> Inputs:
-        """Return the gas and the times in units of its path length and impact speed."""
-        scene, length = reduced_scene(gas), gas.path_length
-        reduced = times * gas.impact_speed / length
-        if scene.drag is not None:
-            reduced = transformed_times(scene.drag, reduced)
-        units = Units.of(gas, self.num_particles, length, gas.impact_speed)
-        return Inputs(scene, reduced, None, run.key, units)
+    def scene(self, gas: Gas) -> ReducedScene:
+        """Return the gas in units of its path length and impact speed."""
+        return reduced_scene(gas)
 
-    def differentiable(self, outputs: Callable[..., Outputs], run: Run) -> Callable[..., Outputs]:
+    def units(self, gas: Gas) -> Units:
+        """Return the path length and the impact speed as units."""
+        return Units.from_gas(gas, self.num_particles, gas.path_length, gas.impact_speed)
+
+    def dynamics(
+        self, scene: ReducedScene, dimension: int, replicas: int, traced: bool = False
+    ) -> DSMCDynamics:
+        """Return the steps of the gas."""
+        scheme = Scheme.build(dimension, self.num_particles, self.step)
+        shape = replicas, self.num_particles, dimension
+        return DSMCDynamics(scene=scene, scheme=scheme, shape=shape)
+
+    def differentiable(
+        self, run: Callable[..., Result], shifted: Callable[..., Result]
+    ) -> Callable[..., Result]:
         """Return runs with derivatives in all numbers of a scene; none of them is a frequency."""
-        return differentiable(outputs, lambda scene: scene, lambda scene: None)
+        return differentiable(run, material=lambda scene: scene, frequency=lambda scene: None)
 
-    def outputs(self, inputs: Inputs, directions: Any, dimension: int, run: Run) -> Outputs:
-        """Return the records of a run.
-
-        It fails if too many pairs are faster than the ceiling of the collision rate.
-        """
-        scheme = Scheme.of(dimension, self.num_particles, self.step)
-        dynamics, settings = DSMCDynamics(inputs.scene, scheme), {"model": self}
-        return run_dsmc(dynamics, inputs, directions, self.replicas, run, settings)
+    def derivative_bias(self, gas: Gas, times: Array, flow_share: Array) -> None:
+        """Return None: the gas has no flow."""

@@ -1,26 +1,29 @@
 """Hard spheres: instantaneous impacts in a periodic box, resolved event by event."""
 
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from jaxgran._utils.tracing import any_traced
+from jaxgran._utils.tracing import any_traced, concrete_array
 from jaxgran._utils.validation import Domain, checked_float, python_int
 from jaxgran.data.curve import Particles
 from jaxgran.models import checks
 from jaxgran.models.base import Limitation
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.models.spheres import AbstractSpheres, Plan
-from jaxgran.particles import neighbours
 from jaxgran.particles.capacity import capacities
-from jaxgran.particles.hard.dynamics import MIN_IMPACTS, SPEED_MARGIN, HardDynamics
-from jaxgran.particles.setup import ALLOWED_OVERLAP, allowed_overlap, min_distance
-from jaxgran.particles.state import transformed_times
+from jaxgran.particles.hard.dynamics import (
+    ALLOWED_OVERLAP,
+    MIN_IMPACTS,
+    SPEED_MARGIN,
+    HardDynamics,
+    allowed_overlap,
+)
+from jaxgran.particles.neighbours import least_distance
 from jaxgran.scene.gas import Gas, SphereScene, reduced_scene, sphere_scene
 from jaxgran.theory.averages import collision_rate
 
@@ -51,7 +54,7 @@ class HardSpheres(AbstractSpheres):
 
     Supports all elements of a scene but `jaxgran.Frictional`: rough spheres; containers, cubes or
     boxes of given sides, with exact impacts on their walls, in place of the periodic box; drag,
-    exactly, by impacts in transformed time (`jaxgran.particles.state`), up to gamma t = 18 (8 in
+    exactly, by impacts in transformed time (`jaxgran.particles.elements`), up to gamma t = 18 (8 in
     float32); a drive, with kicks at both ends of each window of some .05 mean free times.
 
     Args:
@@ -67,32 +70,28 @@ class HardSpheres(AbstractSpheres):
         neighbours: the search for pairs: "sweep" (compiled with the rest), "scipy" (on the host),
             "jax-md" (on the device, not inside `jax.jit`), or "auto" for the fastest here.
         differences: step in the logarithm of an impact's loss, in (0, 0.5], of derivatives by
-            differences of whole runs (`jaxgran.gradients.rule`), 0.3 for most uses. They need two
-            more runs for each number of the law and have noise, but no bias in a gas that
+            differences of whole runs (`jaxgran.gradients.differences`), 0.3 for most uses. They
+            need two more runs for each number of the law and have noise, but no bias in a gas that
             clusters. None for projected derivatives.
         plan: static sizes of arrays, see `sized_for`.
 
-    Derivatives of T, collisions, <dr^2> and the dissipated energy are known in every float of the
-    gas and in the times, forward and reverse, for any law. They are thermally projected at every
-    impact (see `jaxgran.gradients.tangents`): the gas is assumed to remember its temperature only,
-    and to continue to cool at the rate of its last 5 mean free times. Compared with finite
-    differences d ln T/d ln A is right within 5 % in boxes shorter than L_c, but 14 % too large
-    after 10 mean free times where flows have begun to hold energy (phi = .2, beta = .3, 1.1 L_c).
-    The curve's ``derivative_bias`` estimates this bias, and `differences` avoids it.
-    Derivatives of <dr^2> use the first Sonine order of diffusion (see
-    `jaxgran.gradients.tangents`), those of the velocity correlation in time a decay at 2/d of the
-    collision rate. The density acts through Enskog's collision frequency only: at fixed N it also
-    changes the box, and with it the growth of flows, which is left out. The derivatives of a_2 and
-    of the final particles are not known, and are nan. Second derivatives are refused. Each replica
-    is simulated in the frame in which it is at rest, unless there are walls or drag. With a given
-    start T_0 is a unit only, and its derivative is 0; the start scales with the diameter.
+    Derivatives of T, T_rot and collisions are known in every float of the gas and in the times,
+    forward and reverse, for any law; of smooth spheres also those of the dissipated energy. The gas
+    is assumed to remember its energies only, of translation and of rotation, whose tangents grow by
+    what each impact, walls, drag and a drive exchange (`jaxgran.gradients.tangents`). Compared with
+    finite differences d ln T/d ln A is right within 5 % in boxes shorter than L_c, but 14 % too
+    large after 10 mean free times where flows have begun to hold energy (phi = .2, beta = .3,
+    1.1 L_c). The curve's ``derivative_bias`` estimates this bias, and `differences` avoids it. The
+    density acts through Enskog's collision frequency only: at fixed N it also changes the box, and
+    with it the growth of flows, which is left out. All other derivatives, as of a_2, <dr^2>, the
+    velocity correlation and the final particles, are nan. Second derivatives are refused. Each
+    replica is simulated in the frame in which it is at rest, unless there are walls or drag. With a
+    given start T_0 is a unit only, and its derivative is 0; the start scales with the diameter.
 
-    With elements the derivatives of T, T_rot and collisions are known in every float of the gas,
-    and all others are nan. The gas is then assumed to remember its two energies
-    (`jaxgran.gradients.tangents`), but not the positions of its spheres, except that it is denser
-    before walls the more energy they take (`jaxgran.scene.elements`). Compared with differences
-    (N = 500, eps_w = .8) a derivative in eps_w is right within 2 %; that of T_rot in beta_t of
-    rough walls, before which spins differ from those in the middle, is up to 20 % too small.
+    The positions of spheres between walls are not remembered, except that the gas is denser before
+    walls the more energy they take (`jaxgran.scene.elements`). Compared with differences (N = 500,
+    eps_w = .8) a derivative in eps_w is right within 2 %; that of T_rot in beta_t of rough walls,
+    before which spins differ from those in the middle, is up to 20 % too small.
 
     Raises:
         ValueError: for numbers out of range.
@@ -111,12 +110,18 @@ class HardSpheres(AbstractSpheres):
     plan: Plan | None = eqx.field(static=True, default=None)
 
     listed_by_skin: ClassVar[float] = 7.0
+    transforms_time: ClassVar[bool] = True
     elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag", "drive")
 
     def __check_init__(self):
         self.check_counts()
         advice = "In mean free times; it only keeps clusters from collapsing, so leave it small."
         checked_float("contact_time", self.contact_time, CONTACT_TIMES, advice)
+
+    @property
+    def projected(self) -> bool:
+        """True: derivatives are projected or by differences."""
+        return True
 
     def check(self, gas: Gas) -> None:
         """Check that the model supports this law and scene.
@@ -133,10 +138,10 @@ class HardSpheres(AbstractSpheres):
     def _check_overlap(self, gas: Gas) -> None:
         if self.start is None or any_traced(gas, self.start):
             return  # the run checks traced values
-        start, side = self.start, self.scene(gas).side
-        position = neighbours.wrap(side, start.position.reshape(-1, gas.dimension) / gas.diameter)
-        closest = float(min_distance(position, side, self.replicas, (8 * len(position), 0)))
-        if closest < 1 - allowed_overlap(position, side):
+        side = float(self.scene(gas).side)
+        boxes = np.asarray(self.start.position, float) / float(gas.diameter)
+        closest = min(least_distance(box, side) for box in boxes)
+        if closest < 1 - float(allowed_overlap(self.start.position.dtype, side)):
             raise ValueError(
                 f"two spheres of the start are {closest:.9g} diameters apart, hard spheres must "
                 "not overlap. Move them apart, or leave start out for a random one."
@@ -163,21 +168,34 @@ class HardSpheres(AbstractSpheres):
             material = material._replace(walls=walls._replace(frequency=per_collision))
         return sphere_scene(gas, self.num_particles, material)
 
-    def dynamics(self, scene: SphereScene, plan: Plan) -> HardDynamics:
-        """Return the equations of motion of the spheres."""
-        numbers = jnp.asarray(self.contact_time, scene.side.dtype), jnp.zeros((), bool)
-        return HardDynamics(scene, plan.replicas, plan.capacity, plan.steps, *numbers)
+    def motion(
+        self, scene: SphereScene, shape: tuple[int, int, int], plan: Plan, engine: str
+    ) -> HardDynamics:
+        """Return the motion of the spheres."""
+        return HardDynamics(
+            scene=scene,
+            shape=shape,
+            capacity=plan.capacity,
+            crowded=plan.equilibration_capacity,
+            listed_by_skin=self.listed_by_skin,
+            engine=engine,
+            share=plan.steps,
+            contact_time=concrete_array(self.contact_time, scene.side.dtype),
+            all_elastic=concrete_array(False),
+        )
 
-    def clock(self, scene: SphereScene, times: Float[Array, "times"]) -> Float[Array, "times"]:
-        """Return the transformed times of a gas with drag, otherwise the times."""
-        drag = scene.drag_rates
-        return times if drag is None else transformed_times(drag, times)
+    def refused_derivatives(self, scene: SphereScene) -> dict[str, Any]:
+        """Return nothing: derivatives are known in all numbers."""
+        return {}
 
-    def planned(self, scene: SphereScene, dimension: int, spare: float | None = None) -> Plan:
+    def planned(
+        self, scene: SphereScene, dimension: int, replicas: int, spare: float | None = None
+    ) -> Plan:
         """Return static sizes; capacities were measured for phi = .001 to .4 (disks: .6) and
         N = 125 to 50 000."""
-        d, n = dimension, self.replicas * self.num_particles
-        around = self.neighbourhood(scene, d)
+        d = dimension
+        n = replicas * self.num_particles
+        around = self.neighbourhood(scene, d, replicas)
         share = max(WINDOW_SHARE, 2 * MIN_IMPACTS / n)
         fastest = SPEED_MARGIN * (0.5 + (2 * math.log(n)) ** 0.5)  # of Maxwell's n speeds
         longest = share if share == WINDOW_SHARE else SKIN_GROWTH * share
@@ -188,5 +206,6 @@ class HardSpheres(AbstractSpheres):
         chosen = min((0.65 + 0.35 * near) * longest, around.listed)
         expected = around.listed, near, chosen, 1.25 * longest
         extra = 1.3 * max(around.in_contact - 0.4, 0.0)  # random positions have more near pairs
-        sizes = capacities(expected, around.lookahead, spare or 1.15, extra, n)
-        return Plan(self.replicas, None, share, *sizes)
+        capacity, crowded = capacities(expected, around.lookahead, spare or 1.15, extra, n)
+        made_for = ("num_particles", self.num_particles), ("replicas", self.replicas)
+        return Plan(made_for, share, capacity, crowded)

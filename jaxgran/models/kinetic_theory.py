@@ -13,8 +13,6 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxgran._utils import status, validation
 from jaxgran._utils.tracing import (
     any_traced,
-    array_module,
-    as_jax_arrays,
     in_compiled_code,
     pad_to,
     truncate_to,
@@ -163,9 +161,8 @@ class KineticTheory(AbstractModel):
             return accuracy
         if gas.container is not None and gas.container.tangential_restitution is not None:
             return SLIDING_ACCURACY
-        xp = array_module(gas)
-        first = xp.asarray(gas.surface.rotational_temperature)
-        return xp.where(first > 0, SLIDING_ACCURACY, accuracy).astype(first.dtype)
+        first = gas.surface.rotational_temperature
+        return jnp.where(first > 0, SLIDING_ACCURACY, accuracy).astype(first.dtype)
 
     def displacement_accuracy(self, gas: Gas) -> Any:
         """Relative error of <dr^2> by the Sonine order of D and by correlated collisions.
@@ -177,12 +174,11 @@ class KineticTheory(AbstractModel):
         """
         if gas.container is not None:
             return None
-        xp = array_module(gas)
-        correlation = 0.85 * xp.minimum(gas.packing_fraction, 0.2)
+        correlation = 0.85 * jnp.minimum(gas.packing_fraction, 0.2)
         sonine = 0.005 if self.order > 2 and self.sonine else {2: 0.024, 3: 0.017}[gas.dimension]
         if gas.surface is not None:  # spins and velocities are correlated: DSMC, beta_t = .5
             sonine += 0.07
-        return xp.hypot(sonine, correlation)
+        return jnp.hypot(sonine, correlation)
 
     def cooling_rate(self, gas: Gas) -> Float[Array, ""]:
         """Return ``-d ln T/dt`` at t = 0, 1/s, of a Maxwellian gas; < 0 if the law heats it."""
@@ -231,29 +227,33 @@ class KineticTheory(AbstractModel):
                 "rotation=True needs spheres that rotate: add surface=jaxgran.Rough(...), or leave "
                 "rotation out."
             )
-        xp = array_module(gas, times)
-        frequency = xp.asarray(gas.collision_frequency)
-        # T changes little between the times of a grid in ln(1 + t/tau_c).
-        grid = xp.linspace(0.0, 1.0, NUM_GRID_TIMES) * xp.log1p(frequency * times[-1])
-        grid = xp.concatenate([xp.asarray(times), xp.expm1(grid) / frequency])
-        padded = pad_to(xp.sort(grid), padded_length(grid.size))
-        place = xp.searchsorted(padded, xp.asarray(times))
-        whole, fault = self._compiled_covariance(gas, as_jax_arrays(padded), rotation)
+        padded = pad_to(times, padded_length(times.size))
+        whole, fault = self._compiled_covariance(gas, padded, rotation)
         if not any_traced(fault) and int(fault) != status.OK:
             raise RuntimeError(status.explain(int(fault)))
-        rows = xp.concatenate([place, place + padded.size]) if rotation else place
+        rows = np.arange(times.size)
+        if rotation:
+            rows = np.concatenate([rows, rows + padded.size])
         return whole[rows][:, rows] / num_particles
 
     @eqx.filter_jit
     def _compiled_covariance(
         self, gas: Gas, times: Float[Array, "times"], rotation: bool
     ) -> tuple[Float[Array, "n n"], Any]:
-        scene, reduced = self._reduced(gas, times)
-        state, fault = self._solver(gas, times, 1.0).moments(scene, reduced)
-        curve = self._curve(gas, times, state, fault)
+        # T changes little between the times of a grid in ln(1 + t/tau_c).
+        frequency = gas.collision_frequency
+        shares = jnp.linspace(0.0, 1.0, NUM_GRID_TIMES, dtype=times.dtype)
+        between = jnp.expm1(shares * jnp.log1p(frequency * times[-1])) / frequency
+        grid = jnp.sort(jnp.concatenate([times, between]))
+        scene, reduced = self._reduced(gas, grid)
+        state, fault = self._solver(gas, grid, 1.0).moments(scene, reduced)
+        curve = self._curve(gas, grid, state, fault)
         options = {"softness": self.softness, "correlations": self.correlations}
         whole = run_covariance(gas, curve, state.spins, rotation=rotation, **options)
-        return whole, curve.status
+        rows = jnp.searchsorted(grid, times)
+        if rotation:
+            rows = jnp.concatenate([rows, rows + grid.size])
+        return whole[rows][:, rows], curve.status
 
     def check(self, gas: Gas) -> None:
         """Raise ValueError if the law heats the gas, or contacts are too soft for the theory."""

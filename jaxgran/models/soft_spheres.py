@@ -46,6 +46,20 @@ BLOCK_LENGTHS = 1.2
 MAX_STORED_ENERGY = 0.5
 """Energy of the contacts of a start, over the kinetic energy, without a warning."""
 
+FRICTION_REFUSED = (
+    "the derivative of a run of SoftSpheres in the tangential_damping, friction or inertia of "
+    "contacts is not known. Hold them fixed with jax.lax.stop_gradient, take differences of runs, "
+    "or for a short run use SoftSpheres(projection=None)"
+)
+"""What is said of derivatives in the numbers of frictional contacts."""
+
+LENGTHS_REFUSED = (
+    "the derivative in the side of a container, or in the diameter or packing_fraction of the gas "
+    "in it, is not known. Hold them fixed with jax.lax.stop_gradient, take differences of runs, or "
+    "use KineticTheory()"
+)
+"""What is said of derivatives in lengths between walls."""
+
 INTEGRATION_ERROR = 0.001
 """Relative error of T by the time steps, with which eps is right to 1e-4."""
 
@@ -80,25 +94,22 @@ class SoftSpheres(AbstractSpheres):
             agree for 0.02 to 0.5 (see `jaxgran.gradients.tangents`). None for the plain
             derivative, which is exact, and useless after 3 to 5 collisions per particle.
         differences: step in the logarithm of an impact's loss, in (0, 0.5], of derivatives by
-            differences of whole runs (`jaxgran.gradients.rule`), 0.3 for most uses. They need two
-            more runs for each of A and alpha and have noise, but no bias in a gas that clusters.
-            None for projected derivatives.
+            differences of whole runs (`jaxgran.gradients.differences`), 0.3 for most uses. They
+            need two more runs for each of A and alpha and have noise, but no bias in a gas that
+            clusters. None for projected derivatives.
         plan: static sizes of arrays, see `sized_for`.
 
-    Derivatives of T, collisions, <dr^2> and the energies are known in every float of the gas,
-    forward and reverse: a gas depends on (alpha, A), its collision frequency and the times only.
-    The run computes tangents in alpha and A. The density acts through Enskog's collision frequency
-    only: at fixed N it also changes the box, and with it the growth of flows, which is left out.
-    The tangent of T is exact but for the projection, and the others are estimated from it: those of
-    <dr^2> by the first Sonine order of diffusion (see `jaxgran.gradients.tangents`), that of the
-    velocity correlation in time by a decay at 2/d of the collision rate. The run also computes
-    tangents in walls, drag and friction, and of T_rot (`jaxgran.gradients.tangents`); between walls
-    derivatives in lengths and the density are refused. Derivatives that are not known are nan:
-    those of a_2 and of the final particles, with friction those of <dr^2> and the velocity
-    correlation, and those in a rotational_temperature of 0. Second derivatives are refused. In
-    boxes above L_c derivatives are too large; the curve estimates this bias (``derivative_bias``),
-    and `differences` avoids it. Each replica is simulated in the frame in which it is at rest. With
-    a given start T_0 is a unit only, and its derivative is 0.
+    Derivatives of T, T_rot, collisions and the energies are known, forward and reverse: a gas
+    depends on (alpha, A), its walls and drag, its collision frequency and the times only. The
+    density acts through Enskog's collision frequency only: at fixed N it also changes the box, and
+    with it the growth of flows, which is left out. The tangent of T is exact but for the
+    projection, and the others are estimated from it (`jaxgran.gradients.tangents`). All others, as
+    of a_2, <dr^2>, the velocity correlation and the final particles, and derivatives in a
+    rotational_temperature of 0, are nan. Derivatives in the friction, tangential_damping and
+    inertia of contacts, between walls those in lengths and the density, and second derivatives are
+    refused. In boxes above L_c derivatives are too large; the curve estimates this bias
+    (``derivative_bias``), and `differences` avoids it. Each replica is simulated in the frame in
+    which it is at rest. With a given start T_0 is a unit only, and its derivative is 0.
 
     Raises:
         ValueError: for numbers out of range.
@@ -155,15 +166,17 @@ class SoftSpheres(AbstractSpheres):
                         "Give the walls tangential_damping and friction instead, or use "
                         "HardSpheres."
                     )
-        self._ask_about_overlaps(gas)
+            self._ask_about_overlaps(gas)
 
     def _ask_about_overlaps(self, gas: Gas) -> None:
         """Warn if contacts of the start store much energy, which becomes thermal motion."""
-        start, law = self.start, gas.law
+        start = self.start
+        law = gas.law
         if start is None or any_traced(gas, start) or not isinstance(law, Viscoelastic):
             return
         side = np.broadcast_to(np.asarray(start.box_side, float), (gas.dimension,))
-        stored, diameter = 0.0, float(gas.diameter)
+        stored = 0.0
+        diameter = float(gas.diameter)
         for x in np.asarray(start.position, float):
             tree = scipy.spatial.KDTree(x % side, boxsize=None if gas.container else side)
             distance = tree.sparse_distance_matrix(tree, diameter, output_type="coo_matrix").data
@@ -206,27 +219,46 @@ class SoftSpheres(AbstractSpheres):
             friction = None
             if box.tangential_damping is not None and box.friction is not None:
                 friction = ReducedFriction(box.tangential_damping, box.friction)
-            walls = ReducedWalls(ReducedContact.of(wall_law.of_wall(), gas), None, friction)
-        material = ReducedScene(ReducedContact.of(law, gas), surface, walls)
+            walls = ReducedWalls(ReducedContact.from_law(wall_law.of_wall(), gas), None, friction)
+        material = ReducedScene(ReducedContact.from_law(law, gas), surface, walls)
         return sphere_scene(gas, self.num_particles, material)
 
-    def non_differentiable(self, scene: SphereScene) -> Any:
-        """Return the lengths and the collision frequency between walls, otherwise nothing."""
-        if scene.container is None:
-            return ()
-        return scene.side, scene.container, scene.collision_frequency
+    def refused_derivatives(self, scene: SphereScene) -> dict[str, Any]:
+        """Return numbers of a scene in which the derivative of a run is not known, by a message.
 
-    def dynamics(self, scene: SphereScene, plan: Plan) -> SoftDynamics:
-        """Return the equations of motion of the spheres."""
-        projection = concrete_array(self.projection or np.inf, scene.side.dtype)
-        steps = self.steps_per_contact, plan.steps
-        return SoftDynamics(scene, plan.replicas, plan.capacity, *steps, projection)
+        These are the numbers of frictional contacts, and lengths between walls.
+        """
+        friction = [scene.material.surface and scene.material.surface._replace(ratio=None)]
+        lengths = []
+        if scene.container is not None:
+            friction.append(scene.material.walls.surface)
+            lengths = [scene.side, scene.container, scene.collision_frequency]
+        return {FRICTION_REFUSED: friction, LENGTHS_REFUSED: lengths}
 
-    def planned(self, scene: SphereScene, dimension: int, spare: float | None = None) -> Plan:
+    def motion(
+        self, scene: SphereScene, shape: tuple[int, int, int], plan: Plan, engine: str
+    ) -> SoftDynamics:
+        """Return the motion of the spheres."""
+        return SoftDynamics(
+            scene=scene,
+            shape=shape,
+            capacity=plan.capacity,
+            crowded=plan.equilibration_capacity,
+            listed_by_skin=self.listed_by_skin,
+            engine=engine,
+            steps_per_contact=self.steps_per_contact,
+            steps_per_block=plan.steps,
+            projection=concrete_array(self.projection or np.inf, scene.side.dtype),
+        )
+
+    def planned(
+        self, scene: SphereScene, dimension: int, replicas: int, spare: float | None = None
+    ) -> Plan:
         """Return static sizes; capacities were measured for phi = .01 to .4 (disks: .5) and
         t_c/tau_c = .003 to .3."""
-        d, n = dimension, self.replicas * self.num_particles
-        around = self.neighbourhood(scene, d)
+        d = dimension
+        n = replicas * self.num_particles
+        around = self.neighbourhood(scene, d, replicas)
         duration = round_up(float(scene.contact_duration), grid(n)[0])
         # A block lasts at most a contact, less if spheres fly far in that time.
         contacts_flown = MAX_SPEED * float(scene.contact_duration) / BLOCK_FLIGHT
@@ -243,5 +275,7 @@ class SoftSpheres(AbstractSpheres):
         expected = around.listed, near, touching, 2 * touching / (1 + 1.6 * touching**0.6)
         # At random positions the additional touching pairs are about those without correlation.
         extra = 1.3 * around.in_contact
-        sizes = capacities(expected, around.lookahead, spare or 1.2, extra, n)
-        return Plan(self.replicas, self.steps_per_contact, steps, *sizes)
+        capacity, crowded = capacities(expected, around.lookahead, spare or 1.2, extra, n)
+        names = "num_particles", "replicas", "steps_per_contact"
+        made_for = tuple((name, getattr(self, name)) for name in names)
+        return Plan(made_for, steps, capacity, crowded)

@@ -4,7 +4,6 @@ import dataclasses
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from functools import partial
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -12,21 +11,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from equinox import AbstractClassVar, AbstractVar
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
-from jaxgran._utils import status
-from jaxgran._utils.tracing import any_traced
 from jaxgran._utils.validation import POSITIVE, Domain, checked_float, checked_int
-from jaxgran.data.curve import DEFAULTS, CoolingCurve, Particles, Run
-from jaxgran.gradients.rule import Inputs, Outputs, by_differences, differentiable
+from jaxgran.gradients.differences import by_differences
+from jaxgran.gradients.rule import Result, differentiable
 from jaxgran.models import checks
 from jaxgran.models.error_model import ErrorModel, slope_bias_of_run
 from jaxgran.models.particle_model import AbstractParticleModel
-from jaxgran.particles import neighbours, snapshot
-from jaxgran.particles.capacity import Capacity, Neighbourhood, skin_for_pairs
-from jaxgran.particles.dynamics import AbstractDynamics
-from jaxgran.particles.run import Simulation, simulate_on_host, simulate_traced
-from jaxgran.particles.setup import check_inside, check_start, has_other_box, reduced_start
+from jaxgran.particles.capacity import Capacity, Neighbourhood
+from jaxgran.particles.neighbours import choose_engine
+from jaxgran.particles.snapshot import Units
+from jaxgran.particles.spheres import AbstractSphereDynamics
+from jaxgran.particles.start import check_inside, check_start
 from jaxgran.scene.gas import Gas, SphereScene
 
 DIFFERENCE_STEPS = Domain(0.0, 0.5, high_allowed=True)
@@ -40,15 +37,13 @@ class Plan(NamedTuple):
     """Static sizes of a compiled run.
 
     Attributes:
-        replicas: number of boxes.
-        steps_per_contact: see `SoftSpheres`; None for hard spheres.
+        made_for: fields of the model, and their values, for which the sizes are made.
         steps: time steps in a block of soft spheres, impacts per particle in a window of hard ones.
         capacity: sizes of the arrays of the run.
         equilibration_capacity: sizes of the arrays in the first mean free times of equilibration.
     """
 
-    replicas: int
-    steps_per_contact: int | None
+    made_for: tuple[tuple[str, int], ...]
     steps: Any
     capacity: Capacity
     equilibration_capacity: Capacity
@@ -58,14 +53,12 @@ class AbstractSpheres(AbstractParticleModel):
     """A model of spheres in periodic boxes.
 
     Attributes:
-        start: positions and velocities given by a user; None for random ones.
         neighbours: the search for pairs.
         differences: step of derivatives by differences; None for projected ones.
         plan: static sizes from `sized_for`; None if they follow from the gas.
         listed_by_skin: pairs per particle that the skin adds to a neighbour list.
     """
 
-    start: AbstractVar[Particles | None]
     neighbours: AbstractVar[str]
     differences: AbstractVar[float | None]
     plan: AbstractVar[Plan | None]
@@ -74,15 +67,38 @@ class AbstractSpheres(AbstractParticleModel):
     has_positions: ClassVar[bool] = True
     derivative_accuracy: ClassVar[float] = 0.02
 
-    @property
-    def projected(self) -> bool:
-        """True if derivatives are projected or by differences, False if they are plain."""
-        return True
+    @abstractmethod
+    def scene(self, gas: Gas) -> SphereScene:
+        """Return the gas in units of its diameter, mass and initial temperature."""
 
-    def neighbourhood(self, scene: SphereScene, dimension: int) -> Neighbourhood:
+    @abstractmethod
+    def planned(
+        self, scene: SphereScene, dimension: int, replicas: int, spare: float | None = None
+    ) -> Plan:
+        """Return static sizes for a scene of known numbers, with a spare factor on capacities."""
+
+    @abstractmethod
+    def motion(
+        self, scene: SphereScene, shape: tuple[int, int, int], plan: Plan, engine: str
+    ) -> AbstractSphereDynamics:
+        """Return the motion of the spheres.
+
+        Args:
+            scene: the gas in the units of the run.
+            shape: number of replicas, of particles in each, and dimension.
+            plan: static sizes.
+            engine: search for pairs, see `jaxgran.particles.neighbours`.
+        """
+
+    @abstractmethod
+    def refused_derivatives(self, scene: SphereScene) -> dict[str, Any]:
+        """Return numbers of a scene in which the derivative of a run is not known, by a message."""
+
+    def neighbourhood(self, scene: SphereScene, dimension: int, replicas: int) -> Neighbourhood:
         """Return the expected numbers of neighbours in a scene of known numbers."""
-        side, n = float(scene.filled_side), self.num_particles
-        around = Neighbourhood.of(side, n, self.replicas, dimension, self.listed_by_skin)
+        side = float(scene.filled_side)
+        n = self.num_particles
+        around = Neighbourhood.expected(side, n, replicas, dimension, self.listed_by_skin)
         if scene.container is None:
             return around
         shorter = max(1.0, side / float(scene.container[0]))  # the sweep runs along the first axis
@@ -95,35 +111,6 @@ class AbstractSpheres(AbstractParticleModel):
         return error_model.noise_of_differences(
             self.differences, math.hypot(*self.noise(error_model))
         )
-
-    @abstractmethod
-    def scene(self, gas: Gas) -> SphereScene:
-        """Return the gas in units of its diameter, mass and initial temperature."""
-
-    @abstractmethod
-    def planned(self, scene: SphereScene, dimension: int, spare: float | None = None) -> Plan:
-        """Return static sizes for a scene of known numbers, with a spare factor on capacities."""
-
-    @abstractmethod
-    def dynamics(self, scene: SphereScene, plan: Plan) -> AbstractDynamics:
-        """Return the equations of motion of the spheres."""
-
-    def clock(self, scene: SphereScene, times: Float[Array, "times"]) -> Float[Array, "times"]:
-        """Return the times of the run at reduced times."""
-        return times
-
-    def invalid_times(
-        self, gas: Gas, times: Float[Array, "times"]
-    ) -> tuple[Bool[Array, "times"], Int[Array, ""]]:
-        """Return a mask of the times that the run cannot reach, and the status for them."""
-        late, fault = super().invalid_times(gas, times)
-        # Traced values could not be checked before the run.
-        other_box = has_other_box(self.start, gas, self.num_particles)
-        return late | other_box, fault | status.flag(status.BOX_MISMATCH, other_box)
-
-    def non_differentiable(self, scene: SphereScene) -> Any:
-        """Return the numbers of a scene in which the derivative of a run is not known."""
-        return ()
 
     def check_fit(self, names: tuple[str, ...]) -> None:
         """Refuse plain derivatives, and the temperature and lengths of a given start."""
@@ -151,79 +138,61 @@ class AbstractSpheres(AbstractParticleModel):
         """
         checked_float("spare", spare, POSITIVE, "2 is twice the expected need.")
         self.check_scene(checks.checked_gas(gas))
-        plan = self.planned(self.scene(gas), gas.dimension, spare)
+        plan = self.planned(self.scene(gas), gas.dimension, self.replicas, spare)
         return dataclasses.replace(self, plan=plan)
 
-    def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
-        """Return the cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
-        if self.start is not None:  # then T_0 is a constant unit of speed in derivatives
-            gas = gas.replace(temperature=jax.lax.stop_gradient(gas.temperature))
-        return super().simulate(gas, times, run)
+    def units(self, gas: Gas) -> Units:
+        """Return the diameter and the thermal speed as units."""
+        speed = jnp.sqrt(gas.temperature)
+        return Units.from_gas(gas, self.num_particles, gas.diameter, speed)
 
-    def inputs(self, gas: Gas, times: Float[Array, "times"], run: Run) -> Inputs:
-        """Return the gas, the times and the start in units of the run."""
-        scene, speed = self.scene(gas), jnp.sqrt(gas.temperature)
-        return Inputs(
-            scene=scene,
-            times=self.clock(scene, times * speed / gas.diameter),
-            start=reduced_start(self.start, gas, differentiable=not self.projected),
-            key=run.key,
-            units=snapshot.Units.of(gas, self.num_particles, gas.diameter, speed),
-        )
-
-    def differentiable(self, outputs: Callable[..., Outputs], run: Run) -> Callable[..., Outputs]:
+    def differentiable(
+        self, run: Callable[..., Result], shifted: Callable[..., Result]
+    ) -> Callable[..., Result]:
         """Return runs with projected derivatives, with differences of runs, or unchanged."""
         if not self.projected:
-            return outputs
+            return run
         if self.differences is not None:
-            shifted = partial(outputs, run=Run(run.key, run.progress))  # these write no files
-            outputs = by_differences(outputs, shifted, self.differences)
-        return differentiable(outputs, non_differentiable=self.non_differentiable)
-
-    def single_replica(self: S) -> S:
-        """Return the model of one replica; the inputs of its run have its start."""
-        return dataclasses.replace(self, replicas=1, start=None, plan=None)
-
-    def outputs(self, inputs: Inputs, directions: Any, dimension: int, run: Run) -> Outputs:
-        """Run all replicas in one array, from the host unless a number of the inputs is traced."""
-        plan = self._known_plan(inputs.scene, dimension)
-        side = inputs.scene.filled_side
-        sim = Simulation(
-            dynamics=self.dynamics(inputs.scene, plan),
-            equilibration_capacity=plan.equilibration_capacity,
-            inputs=inputs,
-            directions=directions,
-            num_particles=self.num_particles,
-            dimension=dimension,
-            skin=skin_for_pairs(self.listed_by_skin, self.num_particles, side, dimension),
-            engine=self.neighbours,
-            save=snapshot.save_function(run.save),
+            run = by_differences(run, shifted, self.differences)
+        return differentiable(
+            run,
+            material=lambda scene: scene.material,
+            frequency=lambda scene: scene.collision_frequency,
+            refused=self.refused_derivatives,
         )
-        if not any_traced(inputs):
-            model = dataclasses.replace(self, start=None, plan=None)
-            return simulate_on_host(sim, run, {"model": model, "steps": plan.steps})
-        if self.neighbours == "jax-md":
+
+    def dynamics(
+        self, scene: SphereScene, dimension: int, replicas: int, traced: bool = False
+    ) -> AbstractSphereDynamics:
+        """Return the motion of the spheres, with arrays of the planned sizes."""
+        plan = self._known_plan(scene, dimension, replicas)
+        engine = choose_engine(self.neighbours, plan.capacity.lookahead, traced)
+        if traced and engine == "jax-md":
             raise ValueError(
                 'inside jax.jit or jax.vmap neighbours="jax-md" is not supported, since it sizes '
                 "its cells from known numbers: leave neighbours out"
             )
-        return simulate_traced(sim)
+        return self.motion(scene, (replicas, self.num_particles, dimension), plan, engine)
 
-    def _known_plan(self, scene: SphereScene, dimension: int) -> Plan:
-        """Return the plan of the model, or a new one if all numbers that it needs are known."""
+    def _known_plan(self, scene: SphereScene, dimension: int, replicas: int) -> Plan:
+        """Return the plan of the model, or a new one if all numbers that it needs are known.
+
+        The plan of the model is for all its replicas in one array.
+        """
         name = type(self).__name__
         if self.plan is not None:
-            for setting in ("replicas", "steps_per_contact"):
-                planned, value = getattr(self.plan, setting), getattr(self, setting, None)
+            for setting, planned in self.plan.made_for:
+                value = getattr(self, setting)
                 if planned != value:
                     raise ValueError(
                         f"this {name} was sized for {setting} = {planned!r}, and now has "
                         f"{value!r}. Call sized_for(gas) again."
                     )
-            return self.plan
+            if replicas == self.replicas:
+                return self.plan
         try:
             with jax.ensure_compile_time_eval():
-                return self.planned(scene, dimension)
+                return self.planned(scene, dimension, replicas)
         except jax.errors.ConcretizationTypeError:
             raise ValueError(
                 "inside jax.jit the sizes of arrays must be known. Use "
@@ -242,7 +211,7 @@ class AbstractSpheres(AbstractParticleModel):
         """Check the whole numbers of the model against their minima, and its other settings."""
         for name, lowest in ({"num_particles": 2, "replicas": 1} | minimum).items():
             checked_int(name, getattr(self, name), lowest)
-        neighbours.choose_engine(self.neighbours)
+        choose_engine(self.neighbours)
         if self.differences is None:
             return
         advice = "In the logarithm of an impact's loss: 0.3, or None for projected derivatives."

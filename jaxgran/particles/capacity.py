@@ -10,11 +10,9 @@ from math import ceil, log, pi
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Int
 
 from jaxgran._utils import status
-from jaxgran._utils.tracing import any_traced
 from jaxgran.particles.neighbours import unsorted_share
 from jaxgran.scene.geometry import contact_value, sphere_surface
 
@@ -96,7 +94,7 @@ class Neighbourhood(NamedTuple):
     lookahead: float
 
     @classmethod
-    def of(
+    def expected(
         cls, side: float, num_particles: int, replicas: int, dimension: int, listed_more: float
     ) -> "Neighbourhood":
         """Return the numbers for a box.
@@ -136,7 +134,8 @@ def capacities(
         num_particles: number of particles of all replicas, the largest number of members.
     """
     spare = max(spare * grid(num_particles)[1], 1.0)
-    counts, spares = [num_particles * x for x in expected], (spare**0.5, spare, spare, spare)
+    counts = [num_particles * x for x in expected]
+    spares = (spare**0.5, spare, spare, spare)
     pairs, near, contacts, members = (
         int(s * x + 5 * x**0.5) + 64 for s, x in zip(spares, counts, strict=True)
     )
@@ -151,10 +150,11 @@ def capacities(
 
 def skin_for_pairs(listed_more: float, num_particles: int, side: ArrayLike, dimension: int) -> Any:
     """Return the skin, in diameters, that adds `listed_more` listed pairs per particle."""
-    xp, side = (jnp, side) if any_traced(side) else (np, np.asarray(side))  # nothing is compiled
     volume = num_particles * sphere_surface(dimension) / (2 * dimension)
-    in_contact = volume / xp.asarray(side**dimension)
-    return xp.minimum((1 + listed_more / in_contact) ** (1 / dimension) - 1, max_skin(side))
+    in_contact = volume / side**dimension
+    skin = (1 + listed_more / in_contact) ** (1 / dimension) - 1
+    longest = max_skin(side)
+    return min(skin, longest) if isinstance(side, float) else jnp.minimum(skin, longest)
 
 
 def max_skin(side: ArrayLike) -> Any:

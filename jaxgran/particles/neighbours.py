@@ -85,10 +85,13 @@ def bits_where(
     """
     counts = jax.lax.population_count(words).astype(jnp.int32)
     ends = jnp.cumsum(counts, dtype=jnp.int32)
-    starts, row = ends - counts, jnp.arange(size, dtype=jnp.int32)
+    starts = ends - counts
+    row = jnp.arange(size, dtype=jnp.int32)
     num_starts = jnp.zeros(size, jnp.int32).at[starts].add(1, mode="drop")
     word = jnp.cumsum(num_starts, dtype=jnp.int32) - 1  # the last one that starts up to this row
-    rest, rank, bit = words[word], row - starts[word], jnp.zeros(size, jnp.int32)
+    rest = words[word]
+    rank = row - starts[word]
+    bit = jnp.zeros(size, jnp.int32)
     for half in (16, 8, 4, 2, 1):
         low = jax.lax.population_count(rest & jnp.uint32(2**half - 1)).astype(jnp.int32)
         upper = rank >= low
@@ -99,7 +102,8 @@ def bits_where(
 
 
 _WORD = 32
-_X_STEPS, _YZ_STEPS = 2.0**30, 2.0**32  # grid steps per box side, along x and the other axes
+_X_STEPS = 2.0**30
+_YZ_STEPS = 2.0**32  # grid steps per box side, along x and the other axes
 
 
 def unsorted_share(num_particles: int) -> float:
@@ -245,11 +249,10 @@ class Pairs(NamedTuple):
     lookahead: Int[Array, ""]
 
 
-def wrap(side: ArrayLike, position: Any) -> Any:
-    """Move positions, arrays of JAX or NumPy, by multiples of the side into [0, side)."""
-    xp = np if isinstance(position, np.ndarray) else jnp
-    inside = xp.mod(position, side)
-    return xp.where(inside >= side, 0.0, inside)  # rounding may give exactly `side`
+def wrap(side: ArrayLike, position: Float[Array, "n d"]) -> Float[Array, "n d"]:
+    """Move positions by multiples of the side into [0, side)."""
+    inside = jnp.mod(position, side)
+    return jnp.where(inside >= side, 0.0, inside)  # rounding may give exactly `side`
 
 
 def choose_engine(name: str, ahead: int = 0, traced: bool = False) -> str:
@@ -347,6 +350,14 @@ def close_pairs(points: Float[np.ndarray, "n d"], side: float, cutoff: float) ->
     return tree.query_pairs(cutoff, output_type="ndarray")
 
 
+def least_distance(points: Float[np.ndarray, "n d"], side: float) -> float:
+    """Return the least distance between two points in a periodic box, and 1 if none is less."""
+    i, j = close_pairs(np.mod(points, side) % side, side, 1.0).T
+    separation = points[i] - points[j]
+    separation = separation - side * np.round(separation / side)
+    return float(np.sqrt(np.min(np.sum(separation**2, axis=1), initial=1.0)))
+
+
 def tree_search(
     position: Float[np.ndarray, "particles d"],
     side: float,
@@ -360,7 +371,8 @@ def tree_search(
 
     If any position is not finite, no pairs are returned.
     """
-    pairs, count = np.zeros((2, capacity), np.int32), 0
+    pairs = np.zeros((2, capacity), np.int32)
+    count = 0
     if np.all(np.isfinite(position)):
         boxes = position.reshape(replicas, -1, position.shape[-1]).astype(np.float64)
         boxes = np.where(boxes >= side, 0.0, boxes)  # by rounding
@@ -376,7 +388,8 @@ def tree_search(
 
 def _jax_md_pairs(position, side, cutoff, replicas: int, capacity: int):
     boxes = position.reshape(replicas, -1, position.shape[-1])
-    multiplier, max_multiplier = 1.5, 100.0
+    multiplier = 1.5
+    max_multiplier = 100.0
     with jax.numpy_rank_promotion("allow"):  # jax-md needs it
         while True:
             allocated, update = _jax_md_list(boxes.shape, float(side), float(cutoff), multiplier)

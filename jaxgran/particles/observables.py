@@ -146,7 +146,8 @@ def cell_velocity(
     (4, 4, 4, 3)
     """
     d = position.shape[-1]
-    cell, v = _cell_index(position, side, cells), centred(velocity)
+    cell = _cell_index(position, side, cells)
+    v = centred(velocity)
     number = jnp.bincount(cell, length=cells**d)
     total = jax.ops.segment_sum(v, cell, num_segments=cells**d)
     return (total / number[:, None]).reshape((cells,) * d + (d,))  # 0/0 is nan

@@ -35,7 +35,7 @@ class Units(NamedTuple):
     mass: Float[Array, ""]
 
     @classmethod
-    def of(cls, gas: Gas, num_particles: int, length: Array, velocity: Array) -> "Units":
+    def from_gas(cls, gas: Gas, num_particles: int, length: Array, velocity: Array) -> "Units":
         """Return the units of N particles of a gas, with units of length and velocity."""
         side = box_side(gas, num_particles)
         return cls(length, velocity, 2 * velocity / gas.diameter, side, gas.mass)
@@ -69,20 +69,20 @@ def _without_box(particles: Particles) -> Particles:
 
 
 @partial(jax.jit, static_argnames="save")
-def saved_records(save: Callable[[Particles], Any], particles: Particles) -> dict[str, Any]:
-    """Return the record "saved": a user's function of the particles of each replica.
+def saved(save: Callable[[Particles], Any], particles: Particles) -> Any:
+    """Return what a user's function of the particles of each replica returns, as arrays.
 
     The particles of one replica have arrays of shape (N, d).
     """
 
-    def saved(replica: Particles) -> Any:
+    def of_replica(replica: Particles) -> Any:
         tree = save(replica)
         if not jax.tree.leaves(tree):
             raise ValueError(f"save must return arrays, in any tree, got {tree!r:.60} from it")
         return jax.tree.map(_as_array, tree)
 
     axes: Any = jax.tree.map(lambda _: 0, particles)._replace(box_side=None)
-    return {"saved": jax.vmap(saved, (axes,))(particles)}
+    return jax.vmap(of_replica, (axes,))(particles)
 
 
 def _as_array(leaf: Any) -> Array:

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxgran._utils.tracing import is_known
 from jaxgran._utils.validation import FRACTION, Domain
+from jaxgran.scene.geometry import MIN_BOX
 from jaxgran.scene.laws import ConstantRestitution, RestitutionLaw
 from jaxgran.scene.parameters import ADVICE, Parameter, fields_of, number_named
 
@@ -293,7 +294,7 @@ def check_elements(gas: Any) -> None:
             f"side of the walls must be one number or {dimension} numbers, got shape "
             f"{np.shape(walls.side)}"
         )
-    sides = Domain(low=2.1)
+    sides = Domain(low=MIN_BOX)
     sides.check("side of the walls / diameter", walls.side / gas.diameter, "Enlarge the box.")
     if walls.tangential_restitution is not None and not isinstance(surface, Rough):
         raise ValueError(

@@ -544,6 +544,11 @@ class ReducedScene(NamedTuple):
     drive: Any = None
 
     @property
+    def drag_rates(self) -> Any:
+        """`ReducedDrag` in the unit of time of the scene; None without drag."""
+        return self.drag
+
+    @property
     def has_elements(self) -> bool:
         """True unless there are only smooth spheres in free flight."""
         return any(element is not None for element in self[1:])
@@ -592,7 +597,7 @@ class ReducedContact(eqx.Module):
     clipped: bool = eqx.field(static=True)
 
     @classmethod
-    def of(cls, law: laws.Viscoelastic, gas: Gas) -> "ReducedContact":
+    def from_law(cls, law: laws.Viscoelastic, gas: Gas) -> "ReducedContact":
         """Return the contacts of two spheres of a gas with a law."""
         time = gas.diameter / jnp.sqrt(gas.temperature)
         alpha = law.alpha(diameter=gas.diameter, mass=gas.mass) * gas.diameter**0.5 * time**2

@@ -16,6 +16,14 @@ from jaxgran._utils.validation import POSITIVE, UserNumber, float_array
 CLOSE_PACKING = {2: pi / (2 * 3**0.5), 3: pi / (3 * 2**0.5)}
 """Packing fraction of the densest packing of equal disks (2) and of equal spheres (3)."""
 
+PACKING_LIMIT = {2: 0.65, 3: 0.48}
+"""Largest packing fraction of a random start, which is a fluid, by dimension; hard disks and
+spheres freeze at slightly larger ones."""
+
+MIN_BOX = 2.1
+"""Least side of a box in diameters; in a smaller one a sphere could touch another one and its image
+at once."""
+
 
 def sphere_surface(dimension: int) -> float:
     """Surface area of the unit sphere in d dimensions, ``S_d = 2 pi^(d/2) / Gamma(d/2)``."""

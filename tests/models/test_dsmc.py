@@ -9,7 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran import DSMC
-from jaxgran.particles.dsmc import collisions
+from jaxgran.particles.dsmc import collisions, dynamics
 from tests.beads import SI, curves_of, glass_beads, hard_gas
 from tests.test_sliding import sliding
 
@@ -79,7 +79,7 @@ def test_elastic_gas_keeps_its_energy_and_its_maxwellian():
 
 @pytest.mark.parametrize("n", [2, 64, 101])
 def test_every_pair_is_about_equally_likely(n):
-    scheme = collisions.Scheme.of(3, n, 0.1)
+    scheme = collisions.Scheme.build(3, n, 0.1)
 
     def drawn(key):
         i, j, k = collisions.draw_pairs(jax.random.bits(key, (4,)), scheme)
@@ -125,7 +125,8 @@ def test_the_step_is_second_order():
 def test_says_when_impacts_are_too_fast(monkeypatch):
     gas = glass_beads(0.15)
     times = jnp.array([3.0]) * gas.mean_free_time
-    monkeypatch.setattr(collisions, "CEILING", 2.0)  # many pairs are faster
+    for module in (collisions, dynamics):  # many pairs are faster
+        monkeypatch.setattr(module, "CEILING", 2.0)
     model = DSMC(1010, replicas=2)  # of a size that no program was compiled for before
     with pytest.raises(RuntimeError, match="many pairs are faster"):
         jaxgran.cool(gas, times, model=model)
@@ -243,3 +244,22 @@ def test_walls_a_fraction_of_a_mean_free_path_apart_are_met_by_the_fast_spheres_
     assert float(fine.temperature[-1] / gas.temperature) < 0.8
     # Impacts of 20 000 spheres on walls, some each: sqrt(1/20 000) of a loss of .2, .2 % of T.
     np.testing.assert_allclose(curve.temperature, fine.temperature, rtol=0.006)
+
+
+def test_a_derivative_in_the_density_is_one_in_the_times():
+    gas = glass_beads()
+    times = jnp.array([1.0, 3.0]) * gas.mean_free_time
+
+    def temperature(density, scale):
+        denser = gas.replace(packing_fraction=density)
+        return jaxgran.cool(denser, scale * times, model=DSMC(50)).temperature
+
+    def log_frequency(density):
+        return jnp.log(gas.replace(packing_fraction=density).collision_frequency)
+
+    # Neither is a direction in the numbers of the scene: tangents have no rows.
+    density = gas.packing_fraction
+    _, by_density = jax.jvp(lambda x: temperature(x, 1.0), (density,), (1.0,))
+    _, by_time = jax.jvp(lambda x: temperature(density, x), (1.0,), (1.0,))
+    assert np.all(by_time < 0)
+    np.testing.assert_allclose(by_density, jax.grad(log_frequency)(density) * by_time, rtol=1e-9)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.gradients.rule import Inputs, Outputs, by_differences, differentiable, with_tangents
+from jaxgran.gradients.differences import by_differences
+from jaxgran.gradients.rule import Records, Result, differentiable
 from tests.beads import curves_of, glass_beads, soft_beads
 
 TIMES = jnp.array([0.0, 1e-3, 0.3, 2.0, 50.0])
@@ -30,28 +31,32 @@ def temperature(alpha, constant, t):
     return (1 + constant * alpha**0.4 * t) ** (-5 / 3)
 
 
-def run(inputs: Inputs, directions=None) -> Outputs:
+def run(scene, times, start, others, directions=None) -> Result:
     """The course of that gas, as a run of two replicas; it knows its derivative in time."""
+    alpha, constant = scene.material
 
     def at(t):
-        T = temperature(*inputs.scene.material, t) * jnp.ones(2)
-        records = {"temperature": T, "collisions": jnp.log1p(inputs.scene.material[1] * t) * T**0}
+        T = temperature(alpha, constant, t) * jnp.ones(2)
+        values = {"temperature": T, "collisions": jnp.log1p(constant * t) * T**0}
         if directions is None:
-            return records
-        p = len(directions[0])
-        rates = {"temperature": jax.grad(temperature, 2)(*inputs.scene.material, t) * T**0}
-        return with_tangents(records, {}, rates, jnp.zeros((p, 2)))
+            return Records(values, {}, {})
+        rate = jax.grad(temperature, 2)(alpha, constant, t)
+        rates = {"temperature": rate * T**0, "collisions": 0 * T}
+        unknown = jnp.zeros((len(directions[0]), 2))
+        return Records(values, rates, {name: unknown for name in values})
 
-    nothing = jnp.zeros((2, 1))
-    status = jnp.zeros((), jnp.int32)
-    return Outputs(nothing, nothing, jax.vmap(at)(inputs.times), status)
+    return Result(jax.vmap(at)(times), None, jnp.zeros((), jnp.int32))
 
 
 def of_haff(step):
-    rule = differentiable(by_differences(run, run, step), lambda scene: scene.material)
+    rule = differentiable(
+        by_differences(run, run, step),
+        material=lambda scene: scene.material,
+        frequency=lambda scene: scene.collision_frequency,
+    )
 
     def records(numbers, times=TIMES):
-        return rule(Inputs(Haff(tuple(numbers)), times, None, None)).records
+        return rule(Haff(tuple(numbers)), times, None, None).records.values
 
     return records
 
@@ -78,13 +83,13 @@ def test_a_gas_of_haff_has_its_derivative_for_any_step(step):
 
 
 def test_a_fault_of_any_run_is_one_of_the_derivative():
-    def failing(inputs):
-        return run(inputs)._replace(status=jnp.asarray(4, jnp.int32))
+    def failing(*inputs):
+        return run(*inputs)._replace(status=jnp.asarray(4, jnp.int32))
 
     found = by_differences(run, failing, 0.3)
-    inputs = Inputs(Haff(tuple(AT)), TIMES, None, None)
-    assert int(found(inputs, (jnp.ones(1), jnp.zeros(1))).status) == 4
-    assert int(found(inputs).status) == 0
+    inputs = Haff(tuple(AT)), TIMES, None, None
+    assert int(found(*inputs, (jnp.ones(1), jnp.zeros(1))).status) == 4
+    assert int(found(*inputs).status) == 0
 
 
 @pytest.mark.slow

@@ -1,8 +1,8 @@
 """Direct simulation Monte Carlo (DSMC): velocities that change by random collisions.
 
-- `collisions`: the state of a run, and one step of many collisions, with walls, a drive and drag.
-- `run`: initial states, records, a whole run as a pure function, and its parts for the host.
+- `collisions`: candidate pairs, the outcome of their collisions, and subsets of the particles.
+- `dynamics`: the steps of a run, with walls, a drive and drag, its state and its records.
 
-May import the modules directly under `particles` and the floors below; not `soft` nor `hard`.
-Imported by: models.
+May import the modules directly under `particles`, except for `run`, and the floors below; not
+`soft` nor `hard`. Imported by `models` only.
 """

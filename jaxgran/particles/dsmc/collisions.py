@@ -1,49 +1,23 @@
-"""Steps of direct simulation Monte Carlo (DSMC): random collisions in a homogeneous gas.
-
-A step draws candidate pairs, decides which of them collide, and changes their velocities. It also
-applies walls and a drive, and updates the tangents of the run. Spins are ``s = (sigma/2) w``, a
-velocity. With drag the velocities, spins and time are transformed: see `jaxgran.particles.state`.
+"""Random collisions of DSMC: candidate pairs, their outcome, and subsets of the particles.
 
 Candidates are a Poisson process, as collisions of a gas are: a step has a fixed number of them, and
 takes the time in which so many happen (`waiting_time`). In steps of fixed length T of a run would
 scatter less: by .87 of the variance.
-
-Walls and a drive act on subsets of the particles. The kicks of a drive in one step are far smaller
-than the velocities. So each half of a step kicks only some of the subsets, in turn, with the
-variance of all steps until their next turn: the mean energy of a step is the same, at a lower cost.
-The energy of a kick is limited; under a strong drive each half of a step kicks all particles.
-
-Subsets that hit walls are drawn at random in each step, so that spheres hit walls with their
-current velocity. With fixed turns, a mean free time apart, spheres that have lost speed would not
-come later, and the loss would be .9 % of T too large. A step draws as many subsets as the fastest
-spheres need, and a sphere in them hits a wall with a larger probability.
 """
 
 from collections.abc import Callable
-from functools import cache, partial
+from functools import cache
 from math import gcd, pi, sqrt
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt, UInt32
+from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt, UInt32
 
-from jaxgran.gradients.tangents import ExchangeTangents, PathTangents
-from jaxgran.particles.state import (
-    MAX_KICK,
-    DragDecay,
-    drag_decay,
-    kick_variance,
-    random_kicks,
-    tangential_impulse,
-    threefry_key,
-)
-from jaxgran.scene.elements import wall_impact_ratio
+from jaxgran.particles.elements import tangential_impulse
 from jaxgran.scene.gas import ReducedScene
 from jaxgran.scene.geometry import sphere_surface
-from jaxgran.theory.averages import collision_rate
 
 CEILING = 5.0
 """Relative speed, in sqrt(2 T), up to which the collision rate is right; beyond it is constant.
@@ -69,7 +43,7 @@ class Scheme(NamedTuple):
     second: int
 
     @classmethod
-    def of(cls, dimension: int, num_particles: int, step: float) -> "Scheme":
+    def build(cls, dimension: int, num_particles: int, step: float) -> "Scheme":
         """Return the scheme with a number `step` of collisions per particle and step.
 
         If M pairs were drawn one after the other with replacement, ``2 M (M - 1) / N`` of them
@@ -115,60 +89,6 @@ def waiting_time(
     return jnp.maximum(root, 1e-3) ** 3
 
 
-class DSMCTangents(NamedTuple):
-    """Tangents at a fixed scaled time s, ``ds = sqrt(T/T_0) dt``, along p directions in the law.
-
-    The tangent of the velocities is c v / 2. The rate of velocity relaxation, which `PathTangents`
-    takes, is measured on the collisions.
-
-    Attributes:
-        directions: in the scene, stacked along a first axis of each leaf.
-        log_temperature: c = d ln T.
-        clock: tangent of the time.
-        paths: tangents of the paths of the particles.
-    """
-
-    directions: ReducedScene
-    log_temperature: Float[Array, "p *replicas"]
-    clock: Float[Array, "p *replicas"]
-    paths: PathTangents
-
-    @classmethod
-    def initial(cls, directions: ReducedScene, replicas: int, dtype: Any) -> "DSMCTangents":
-        """Return the tangents at t = 0."""
-        paths = PathTangents.initial(directions, replicas, dtype)
-        return cls(directions, paths.correlation_along, paths.correlation_along, paths)
-
-
-class DSMCState(NamedTuple):
-    """State of R replicas of N particles. Units: the impact speed sqrt(2 T_0) and the path length.
-
-    Attributes:
-        time: time that all replicas have reached.
-        clock: start of the step of each replica that ends beyond `time`.
-        clock_rest: rounding error of `clock`, for a compensated sum.
-        duration: length of the next step over its mean, see `waiting_time`.
-        temperature: T/T_0, updated by the losses, recomputed every `RECOUNT_INTERVAL` steps.
-        particles: the 2 d components of v and of x - v t, which only collisions change, and the
-            spins of rough spheres. With drag they are transformed: see `jaxgran.particles.state`.
-        collisions: number of pairs that collided.
-        missed: number of collisions missed because of the `CEILING`.
-        steps: number of steps.
-        tangents: `DSMCTangents`, or `ExchangeTangents` of a scene with elements; None without them.
-    """
-
-    time: Float[Array, ""]
-    clock: Float[Array, "*replicas"]
-    clock_rest: Float[Array, "*replicas"]
-    duration: Float[Array, "*replicas"]
-    temperature: Float[Array, "*replicas"]
-    particles: Float[Array, "*replicas N components"]
-    collisions: Float[Array, "*replicas"]
-    missed: Float[Array, "*replicas"]
-    steps: UInt32[Array, "*replicas"]
-    tangents: Any = None
-
-
 @cache
 def _strides(num_particles: int) -> np.ndarray:
     """Return numbers coprime to N, so small that their product with N fits into 32 bits."""
@@ -188,7 +108,9 @@ def draw_pairs(
     a large divisor with N (one in a hundred at N = 1000) are up to 1.7 times as likely, and the
     probabilities scatter by 6 % (14 % at N = 64).
     """
-    n, first, second = scheme.num_particles, scheme.first, scheme.second
+    n = scheme.num_particles
+    first = scheme.first
+    second = scheme.second
     strides = jnp.asarray(_strides(n))
     stride = strides[bits[0] % len(strides)]
     apart = first + second + bits[1] % (n - 2 * first - second + 1)
@@ -203,30 +125,22 @@ def draw_pairs(
 
 
 class Outcome(NamedTuple):
-    """Outcome of the collisions of candidate pairs: kicks, and sums over the collisions.
+    """Outcome of the collisions of candidate pairs.
 
     Attributes:
-        kick: change of the velocity of the first particle of each pair; that of the second is
+        kick: change of the velocity of the first particle of each pair; the change of the second is
             opposite.
+        spin_change: change of the spins of both particles of each pair.
         num: number of collisions.
         missed: number of collisions missed because of the ceiling of the collision rate.
-        loss: decrease of sum v^2.
-        relaxation: ``sum (1 + eps)^2 (g.n)^2 / 4``, by which D/sqrt(T) decays.
-        along: tangents of -loss and of relaxation along the directions in the law.
-        along_speed: their tangents in the logarithm of all speeds.
-        rotational_gain: increase of q sum s^2 of rough spheres.
-        spin_change: change of the spins of both particles of each pair.
+        gains: increase of sum v^2 and, of spheres that rotate, of q sum s^2.
     """
 
     kick: Float[Array, "pairs d"]
+    spin_change: Float[Array, "pairs spins"]
     num: Float[Array, ""]
     missed: Float[Array, ""]
-    loss: Float[Array, ""]
-    relaxation: Float[Array, ""]
-    along: Float[Array, "2 p"]
-    along_speed: Float[Array, "..."]  # (2,)
-    rotational_gain: Float[Array, ""] | float
-    spin_change: Float[Array, "pairs spins"]
+    gains: Float[Array, "energies"]
 
 
 def collide(
@@ -235,7 +149,6 @@ def collide(
     ceiling: Float[Array, ""],
     share: Float[Array, ""],
     scene: ReducedScene,
-    directions: ReducedScene | None,
     spin: Float[Array, "pairs spins"],
     drag_factor: Float[Array, ""] | float = 1.0,
 ) -> Outcome:
@@ -247,11 +160,11 @@ def collide(
         ceiling: |g| at which a candidate collides with probability 1 in a whole step.
         share: fraction of the step to be done.
         scene: in reduced units.
-        directions: of the tangents; None for no tangents.
         spin: s_i + s_j; smooth spheres have no components.
         drag_factor: ratio of physical velocities to these.
     """
-    d, dtype = relative.shape[-1], relative.dtype
+    d = relative.shape[-1]
+    dtype = relative.dtype
     g = [relative[:, k] for k in range(d)]
     square = sum(x * x for x in g)
     speed = jnp.sqrt(jnp.where(square > 0, square, 1.0))
@@ -265,18 +178,7 @@ def collide(
     cosine = jnp.sqrt(jnp.where(in_disk, 1 - sine_square, 1.0))
     sideways = _perpendicular(axis)
     normal_speed = jnp.where(hit, speed * cosine, ceiling)
-    at_impact, zero = normal_speed * drag_factor, jnp.zeros((), dtype)
-
-    def restitution(law, log_scale):
-        return law.restitution(at_impact * jnp.exp(log_scale))
-
-    if directions is None:
-        eps, along, along_speed = restitution(scene.law, zero), jnp.zeros((2, 0), dtype), zero
-    else:
-        eps, pull = jax.vjp(restitution, scene.law, zero)
-        weights = [jnp.where(hit, x * at_impact**2, 0.0) for x in (eps, (1 + eps) / 2)]
-        in_law, along_speed = jax.vmap(pull)(jnp.stack(weights))
-        along = jax.vmap(slopes_along, (0, None))(in_law, directions.law)
+    eps = scene.law.restitution(normal_speed * drag_factor)
     square = jnp.where(hit, normal_speed**2, 0.0)
     push = jnp.where(hit, (1 + eps) / 2 * normal_speed, 0.0)
     normal = [
@@ -285,14 +187,10 @@ def collide(
     ]
     outcome = Outcome(
         kick=jnp.stack([-push * n for n in normal], axis=-1),
+        spin_change=spin,
         num=jnp.sum(hit, dtype=dtype),
         missed=share * jnp.sum(jnp.where(in_disk, jnp.maximum(speed / ceiling - 1, 0.0), 0.0)),
-        loss=jnp.sum((1 - eps**2) / 2 * square),
-        relaxation=jnp.sum((1 + eps) ** 2 / 4 * square),
-        along=along,
-        along_speed=along_speed,
-        rotational_gain=0.0,
-        spin_change=spin,
+        gains=-jnp.sum((1 - eps**2) / 2 * square)[None],
     )
     if (surface := scene.surface) is None:
         return outcome
@@ -300,12 +198,12 @@ def collide(
     across, kick, spin_change = tangential_impulse(
         relative, spin, normal, hit, surface.eta, surface, push
     )
-    loss = -2 * jnp.sum(kick * (across + kick))  # of translation alone
+    gain = 2 * jnp.sum(kick * (across + kick))  # of translation alone
+    rotational_gain = 2 * surface.inertia * jnp.sum(spin_change * (spin + spin_change))
     return outcome._replace(
         kick=outcome.kick + kick,
-        loss=outcome.loss + loss,
-        rotational_gain=2 * surface.inertia * jnp.sum(spin_change * (spin + spin_change)),
         spin_change=spin_change,
+        gains=jnp.stack([outcome.gains[0] + gain, rotational_gain]),
     )
 
 
@@ -321,23 +219,6 @@ def _perpendicular(axis: list[Float[Array, "pairs"]]) -> list[list[Float[Array, 
         [x * y * a, sign + y * y * a, -y],
     ]
 
-
-def slopes_along(gradient: Any, directions: Any) -> Float[Array, "p"]:
-    """Return the derivatives along some directions, from the derivatives in all numbers."""
-    products = jax.tree.map(lambda g, x: jnp.tensordot(x, g, g.ndim), gradient, directions)
-    return sum(jax.tree.leaves(products), start=jnp.zeros(()))  # a law may have no floats
-
-
-FASTEST_SPEED = 3.5
-"""Speed along an axis, in sqrt(2 T), up to which the rate of impacts on walls is right; one of 1e6
-particles is faster."""
-
-RECOUNT_INTERVAL = 32
-"""Number of steps between computations of T from the velocities.
-
-In between the losses update T. The rounding errors of this sum do not shrink as T falls, and in
-float32 they would dominate T once it has fallen to 1e-7 of its initial value.
-"""
 
 MAX_SUBSETS = 16
 """Number of subsets of many particles."""
@@ -374,13 +255,15 @@ def change_subsets(
             belong to the subset. It returns the changed rows and the sums.
         zero: sums without changes.
     """
-    n, parts = len(particles), num_subsets(len(particles))
+    n = len(particles)
+    parts = num_subsets(len(particles))
     size = -(-n // parts)
 
     def change_one(i: Int[Array, ""], carry: tuple[Array, Sums]) -> tuple[Array, Sums]:
         particles, sums = carry
         index = ((first + i) & (2**30 - 1)) % parts
-        begin, end = index * n // parts, (index + 1) * n // parts
+        begin = index * n // parts
+        end = (index + 1) * n // parts
         top = jnp.minimum(begin, n - size)
         row = top + jnp.arange(size, dtype=top.dtype)
         belongs = (row >= begin) & (row < end) & (i < count)
@@ -389,453 +272,3 @@ def change_subsets(
         return particles, jax.tree.map(jnp.add, sums, more)
 
     return jax.lax.fori_loop(0, largest, change_one, (particles, zero))
-
-
-SubsetCounts = tuple[Int[Array, "*replicas"] | None, Int[Array, "*replicas"] | None]
-"""Numbers of subsets that a drive kicks in half of a step, and of those that may hit walls in the
-step; None without a drive or walls."""
-
-CandidatePairs = tuple[Array, Array, Array]
-"""Candidate pairs of a step: relative velocities, sums of the spins in the state, random bits."""
-
-EnergyGains = tuple[Float[Array, "2"], Float[Array, "changes 2"]]
-"""Gains of sum v^2 and of q sum s^2 of the spins in the state, and their tangents: along directions
-in the scene, of which the last is that of time, and in the logarithms of all velocities and of all
-spins."""
-
-
-class DSMCDynamics(eqx.Module):
-    """The steps of a gas.
-
-    Attributes:
-        scene: the gas in reduced units.
-        scheme: sizes of a step.
-    """
-
-    scene: ReducedScene
-    scheme: Scheme = eqx.field(static=True)
-
-    def drag_decay(self, time: Float[Array, "..."]) -> DragDecay:
-        """Return the decay by drag until a time; ones without drag."""
-        if self.scene.drag is None:
-            return DragDecay(*[jnp.ones_like(time)] * 3)
-        return drag_decay(self.scene.drag, time)
-
-    def kick_growth(
-        self, start: Float[Array, "*replicas"], ds: Float[Array, "*replicas"], place: float
-    ) -> Float[Array, "*replicas"]:
-        """Return the growth of T/T_0 by half of the kicks of a step.
-
-        They come at its start (place 0) or end (1).
-        """
-        return kick_variance(self.scene.drive, self.scene.drag, start, ds, place)
-
-    def max_wall_impacts(
-        self, state: DSMCState, ds: Float[Array, "*replicas"]
-    ) -> Float[Array, "*replicas"]:
-        """Return the number of wall impacts in a step of a sphere of the speed `FASTEST_SPEED`."""
-        walls, d = self.scene.walls, self.scheme.dimension
-        speed = FASTEST_SPEED * jnp.sqrt(state.temperature)
-        eps = walls.law.restitution(speed * self.drag_decay(state.clock).velocity)[..., None]
-        frequency = jnp.broadcast_to(walls.frequency, (*eps.shape[:-1], d))
-        ratio = wall_impact_ratio(eps, frequency / collision_rate(0.0, d), d)
-        return jnp.max(ratio * frequency, axis=-1) * (d * sqrt(pi)) * speed * ds
-
-    def full_step(self, state: DSMCState) -> Float[Array, "*replicas"]:
-        """Return the time in which all candidates of the next step happen."""
-        return state.duration * self.scheme.scaled_step / jnp.sqrt(state.temperature)
-
-    def step_length(self, state: DSMCState) -> Float[Array, "*replicas"]:
-        """Return the length of a step: spheres hit at most one wall, and kicks are small."""
-        ds = self.full_step(state)
-        if self.scene.walls is not None:
-            ds = ds / jnp.maximum(self.max_wall_impacts(state, ds), 1.0)
-        if self.scene.drive is None:
-            return ds
-        growth = self.scene.drive / self.drag_decay(state.clock).velocity ** 3
-        safe = jnp.where(growth > 0, growth, 1.0)
-        return jnp.where(growth > 0, jnp.minimum(ds, MAX_KICK * state.temperature / safe), ds)
-
-    def subsets_per_step(self, state: DSMCState, share: Float[Array, "*replicas"]) -> SubsetCounts:
-        """Return the numbers of subsets that take part in a share of a step.
-
-        A drive kicks so many subsets in half of it that T of none grows by more than the share
-        `MAX_KICK`. Particles that are kicked in turn then have temperatures that differ by up to
-        w T, by which a_2 of all particles is too large by ``w^2/12``, at most 2e-4. So many subsets
-        may hit walls that one of the fastest spheres hits at most one.
-        """
-        parts, temperature = num_subsets(self.scheme.num_particles), state.temperature
-        ds = share * self.full_step(state)
-
-        def at_least(needed: Array) -> Array:
-            return jnp.clip(jnp.ceil(needed), 1, parts).astype(jnp.int32)
-
-        kicks = walls = None
-        if self.scene.drive is not None:
-            growth = self.kick_growth(state.clock, ds, 0.0)
-            safe = jnp.where(temperature > 0, temperature, 1.0)
-            kicks = at_least(parts * growth / (MAX_KICK * safe))
-        if self.scene.walls is not None:
-            walls = at_least(parts * self.max_wall_impacts(state, ds))
-        return kicks, walls
-
-    def step(
-        self,
-        state: DSMCState,
-        key: UInt32[Array, "2"],
-        share: Float[Array, "replicas"],
-        chance: Float[Array, "replicas"],
-    ) -> DSMCState:
-        """Do a share, 0 to 1, of the next step of each replica, with a chance of each candidate."""
-        replicas = jnp.arange(len(state.clock), dtype=jnp.uint32)
-        keys = jax.vmap(jax.random.fold_in, (None, 0))(threefry_key(key), replicas)
-        subsets = self.subsets_per_step(state, share)
-        largest = jax.tree.map(jnp.max, subsets)
-        step_replica = partial(self._step, largest=largest)
-        axes = jax.tree.map(lambda _: 0, state._replace(tangents=None))._replace(time=None)
-        if state.tangents is not None:
-            along = jax.tree.map(lambda _: -1, state.tangents._replace(directions=None))
-            axes = axes._replace(tangents=along)
-        state = jax.vmap(step_replica, (axes, 0, 0, 0, 0), axes)(
-            state, keys, subsets, share, chance
-        )
-        due = state.steps % RECOUNT_INTERVAL == 0
-
-        def recount(temperature):
-            velocity = state.particles[..., : self.scheme.dimension]
-            from_velocities = 2 * jnp.mean(velocity**2, axis=(1, 2))
-            return jnp.where(due, from_velocities, temperature)
-
-        temperature = jax.lax.cond(jnp.any(due), recount, lambda x: x, state.temperature)
-        return state._replace(temperature=temperature)
-
-    def _step(
-        self,
-        state: DSMCState,
-        key: PRNGKeyArray,
-        subsets: SubsetCounts,
-        share: Float[Array, ""],
-        chance: Float[Array, ""],
-        largest: SubsetCounts,
-    ) -> DSMCState:
-        """Do a share, 0 to 1, of a step of one replica; random numbers do not depend on the share.
-
-        Each collision of the whole step takes place with the probability `chance`, so that the
-        state within a step is as accurate as at its end. `largest` are the largest numbers of
-        subsets of all replicas.
-        """
-        scheme, before, tangents = self.scheme, state, state.tangents
-        key = jax.random.fold_in(key, state.steps)
-        dt = share * self.full_step(state)
-        kicks, walls = zip(subsets, largest, strict=True)
-        kick = partial(self._kick, key=key, dt=dt, counts=kicks, clock=state.clock)
-        state = kick(state, place=0)
-        particles, sums, pairs = self._collide(state, key, dt, chance)
-        loss, wall_gains = sums.loss, None
-        if self.scene.walls is not None:
-            particles, wall_loss, wall_gains = self._hit_walls(state, key, dt, particles, walls)
-            loss = loss + wall_loss
-        energy = scheme.num_particles * scheme.dimension / 2  # sum v^2 at T_0
-        temperature = state.temperature - loss / energy
-        passed = state.clock_rest + dt
-        clock = state.clock + passed
-        next_duration = waiting_time(jax.random.fold_in(key, 4), scheme.candidates, state.duration)
-        new = state._replace(
-            clock=clock,
-            clock_rest=passed - (clock - state.clock),
-            duration=jnp.where(share > 0, next_duration, state.duration),
-            temperature=temperature,
-            particles=particles,
-            collisions=state.collisions + sums.num,
-            missed=state.missed + sums.missed,
-            steps=state.steps + (share > 0).astype(state.steps.dtype),
-        )
-        new = kick(new, place=1)
-        if isinstance(tangents, ExchangeTangents):
-            ceiling = CEILING * jnp.sqrt(state.temperature)
-            tangents = self._exchange_tangents(
-                before, ceiling, chance, dt, pairs, wall_gains, sums.num
-            )
-        elif tangents is not None:
-            # The tangent of the velocities is (c/2) v, and the law contributes at every collision.
-            c, after = tangents.log_temperature, energy * temperature
-            along = sums.along + sums.along_speed[:, None] * (c / 2)[None]
-            gain, fading = along / after
-            # In the units of a run T is half of T/T_0.
-            thermal_time = share * state.duration * scheme.scaled_step / sqrt(2)
-            relaxed = sums.relaxation / after
-            tangents = tangents._replace(
-                log_temperature=c + gain,
-                clock=tangents.clock - c / 2 * dt,
-                paths=tangents.paths.after(thermal_time, relaxed, fading, scheme.dimension),
-            )
-        return new._replace(tangents=tangents)
-
-    def _kick(
-        self,
-        state: DSMCState,
-        key: PRNGKeyArray,
-        dt: Float[Array, ""],
-        counts: tuple[Int[Array, ""] | None, Int[Array, ""] | None],
-        clock: Float[Array, ""],
-        place: int,
-    ) -> DSMCState:
-        """Apply half of the kicks of a step, at its start (place 0) or end (1).
-
-        `counts` are the number of subsets of this replica and the largest of any replica.
-        """
-        kicked, largest = counts
-        if kicked is None or largest is None:
-            return state
-        d, parts = self.scheme.dimension, num_subsets(self.scheme.num_particles)
-        growth = self.kick_growth(clock, dt, float(place))
-        key, at_rest = jax.random.fold_in(key, 2 + place), self.scene.walls is None
-        size, time = jnp.sqrt(growth / 2 * (parts / kicked)), state.clock
-
-        def kick(i: Array, rows: Array, belongs: Array) -> tuple[Array, Array]:
-            v = rows[:, :d]
-            kicks = random_kicks(jax.random.fold_in(key, i), v, at_rest, belongs)
-            kicks = jnp.where(belongs[:, None], size * kicks, 0.0)
-            after = [v + kicks, rows[:, d : 2 * d] - time * kicks, rows[:, 2 * d :]]
-            return jnp.concatenate(after, axis=-1), jnp.sum(kicks * (2 * v + kicks))
-
-        first = kicked * (2 * state.steps + place).astype(jnp.int32)
-        zero = jnp.zeros((), growth.dtype)
-        particles, gain = change_subsets(state.particles, first, kicked, largest, kick, zero)
-        grown = 2 * gain / (self.scheme.num_particles * d)
-        return state._replace(particles=particles, temperature=state.temperature + grown)
-
-    def _collide(
-        self, state: DSMCState, key: PRNGKeyArray, dt: Float[Array, ""], chance: Float[Array, ""]
-    ) -> tuple[Float[Array, "N components"], Outcome, tuple[CandidatePairs, CandidatePairs]]:
-        """Return the particles after the collisions of a step, sums over them, and candidates."""
-        d, first, second = self.scheme.dimension, self.scheme.first, self.scheme.second
-        bits = jax.random.bits(key, (2, first + second + 2), jnp.uint32)
-        i, j, k = draw_pairs(bits[:, -2:].ravel(), self.scheme)
-        index = jnp.concatenate([i, j, k])
-        options = {"mode": "promise_in_bounds", "unique_indices": True}
-        old = state.particles.at[index].get(**options)
-        # Collisions happen at the middle of the step, on average: x - v t changes by -kick t.
-        middle = state.clock + dt / 2
-        decay = self.drag_decay(middle)
-        v, spin, spin_factor = old[:, :d], old[:, 2 * d :] * decay.spin, decay.spin
-        scaled = isinstance(state.tangents, DSMCTangents)
-        rule = partial(
-            collide,
-            ceiling=CEILING * jnp.sqrt(state.temperature),
-            share=chance,
-            scene=self.scene,
-            directions=state.tangents.directions if scaled else None,
-            drag_factor=decay.velocity,
-        )
-        firsts = v[:first] - v[first : 2 * first]
-        first_spins = spin[:first] + spin[first : 2 * first]
-        one = rule(firsts, bits[:, :first], spin=first_spins)
-        kick, turn = one.kick, one.spin_change
-        seconds = v[:second] + kick[:second] - v[2 * first :]
-        second_spins = spin[:second] + turn[:second] + spin[2 * first :]
-        two = rule(seconds, bits[:, first:-2], spin=second_spins)
-        kicks = jnp.concatenate([kick[:second] + two.kick, kick[second:], -kick, -two.kick])
-        turns = [turn[:second] + two.spin_change, turn[second:], turn, two.spin_change]
-        changes = [kicks, -middle * kicks, jnp.concatenate(turns) / spin_factor]
-        sums = jax.tree.map(jnp.add, *(x._replace(kick=0.0, spin_change=0.0) for x in (one, two)))
-        new = old + jnp.concatenate(changes, axis=-1)
-        pairs = (
-            (firsts, first_spins / spin_factor, bits[:, :first]),
-            (seconds, second_spins / spin_factor, bits[:, first:-2]),
-        )
-        return state.particles.at[index].set(new, **options), sums, pairs
-
-    def _hit_walls(
-        self,
-        state: DSMCState,
-        key: PRNGKeyArray,
-        dt: Float[Array, ""],
-        particles: Float[Array, "N components"],
-        counts: tuple[Any, Any],
-    ) -> tuple[Float[Array, "N components"], Float[Array, ""], EnergyGains | None]:
-        """Let particles hit walls in a step, independent of their places.
-
-        A sphere between two walls hits one of them ``|v| ds/(L - sigma)`` times in a step, times
-        the ratio of the density before walls to the mean (`wall_impact_ratio`). Each step has walls
-        across one axis, in turn, with d times this number of impacts.
-
-        Returns the particles, the loss of sum v^2, and the gains, None without tangents.
-        """
-        d, middle = self.scheme.dimension, state.clock + dt / 2
-        axis, one = (state.steps % d).astype(jnp.int32), jnp.ones(())
-        across = (jnp.arange(d) == axis).astype(particles.dtype)[None]
-        key, (drawn, largest) = jax.random.fold_in(key, 1), counts
-        parts = num_subsets(len(particles))
-
-        def hit_rows(i: Array, rows: Array, belongs: Array) -> tuple[Array, tuple]:
-            bits = jax.random.bits(jax.random.fold_in(key, i), belongs.shape, jnp.uint16)
-            chance = (bits.astype(particles.dtype) + 0.5) * 2.0**-16 * (drawn / parts)
-            chance = jnp.where(belongs, chance, jnp.inf)
-
-            def hit(scene: ReducedScene, decay: DragDecay, faster: Array, turning: Array) -> tuple:
-                """Return velocities and spins after impacts, and the gains of both energies."""
-                velocity, spin = rows[:, :d] * faster, rows[:, 2 * d :] * turning
-                walls, surface = scene.walls, scene.surface
-                frequency = walls.frequency[axis]
-                normal = jnp.sum(velocity * across, axis=1)
-                speed, outwards = jnp.abs(normal), jnp.sign(normal)[:, None] * across
-                eps = walls.law.restitution(jnp.where(speed > 0, speed * decay.velocity, 1.0))
-                ratio = wall_impact_ratio(eps, frequency / collision_rate(0.0, d), d)
-                often = ratio * (frequency * (d * sqrt(pi)) * dt) * speed
-                hits = (chance < often) & (speed > 0)
-                push = jnp.where(hits, (1 + eps) * speed, 0.0)
-                kick, spin_change = -push[:, None] * outwards, jnp.zeros_like(spin)
-                if surface is not None and walls.surface is not None:
-                    eta = surface.eta_on_wall(walls.surface)
-                    _, sliding_kick, spin_change = tangential_impulse(
-                        velocity, spin, outwards, hits, eta, surface, push
-                    )
-                    kick = kick + sliding_kick
-                # The number of impacts is not differentiable, so weights of value 1 carry its
-                # derivative.
-                weight = frequency * ratio
-                weight = (weight / jax.lax.stop_gradient(weight))[:, None]
-                inertia = 0.0 if surface is None else surface.inertia
-                loss = -jnp.sum(weight * kick * (2 * velocity + kick))
-                gain = inertia * jnp.sum(weight * spin_change * (2 * spin + spin_change))
-                gains = jnp.stack([-loss, gain / decay.spin**2])
-                return velocity + kick, spin + spin_change, gains
-
-            def gained(dynamics: DSMCDynamics, *options: Any) -> Array:
-                return hit(dynamics.scene, *options)[2]
-
-            decay = self.drag_decay(middle)
-            velocity, spin, gain = hit(self.scene, decay, one, decay.spin)
-            gains = None
-            if isinstance(state.tangents, ExchangeTangents):
-                gains = self._energy_gains(gained, middle, state.tangents.directions)
-            after = [velocity, rows[:, d : 2 * d], spin / decay.spin]
-            return jnp.concatenate(after, axis=-1), (-gain[0], gains)
-
-        shapes = jax.eval_shape(hit_rows, jnp.int32(0), particles[:1], jnp.ones(1, bool))[1]
-        zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-        bits = jax.random.bits(jax.random.fold_in(key, MAX_SUBSETS), (), jnp.uint16)
-        first = (bits % parts).astype(jnp.int32)
-        particles, (loss, gains) = change_subsets(particles, first, drawn, largest, hit_rows, zero)
-        return particles, loss, gains
-
-    def _exchange_tangents(
-        self,
-        before: DSMCState,
-        ceiling: Float[Array, ""],
-        share: Float[Array, ""],
-        ds: Float[Array, ""],
-        candidates: tuple[CandidatePairs, CandidatePairs],
-        wall_gains: EnergyGains | None,
-        collisions: Float[Array, ""],
-    ) -> ExchangeTangents:
-        """Return the tangents after a step; see `collide` for its ceiling and share."""
-        d, start, directions = self.scheme.dimension, before.clock, before.tangents.directions
-
-        def by_collisions(
-            dynamics: DSMCDynamics, decay: DragDecay, faster: Array, turning: Array
-        ) -> Array:
-            scene, total = dynamics.scene, jnp.zeros(2, ds.dtype)
-            for relative, spins, bits in candidates:
-                relative, spins = relative * faster, spins * turning
-                outcome = collide(
-                    relative, bits, ceiling, share, scene, None, spins, decay.velocity
-                )
-                gain = outcome.rotational_gain / decay.spin**2
-                total = total + jnp.stack([-outcome.loss, gain])
-            return total
-
-        def by_drive(dynamics: DSMCDynamics, *_: Any) -> Array:
-            growth = sum(dynamics.kick_growth(start, ds, place) for place in (0.0, 1.0))
-            return jnp.stack([self.scheme.num_particles * d / 2 * growth, jnp.zeros_like(ds)])
-
-        gains, along = self._energy_gains(by_collisions, start + ds / 2, directions)
-        if self.scene.drive is not None:
-            kicks, along_kicks = self._energy_gains(by_drive, start + ds / 2, directions)
-            # The rate of impacts depends on the speeds; kicks do not depend on them.
-            gains, along = gains + kicks, along + along_kicks.at[-2].add(-kicks)
-        if wall_gains is not None:
-            gains, along = gains + wall_gains[0], along + wall_gains[1]
-        v, s = before.particles[:, :d], before.particles[:, 2 * d :]
-        inertia = 0.0 if self.scene.surface is None else self.scene.surface.inertia
-        energies = jnp.stack([jnp.sum(v**2), inertia * jnp.sum(s**2)])
-        return before.tangents.after(energies, gains, along, collisions)
-
-    def _energy_gains(
-        self,
-        gained: Callable[..., Float[Array, "2"]],
-        middle: Float[Array, ""],
-        directions: ReducedScene,
-    ) -> EnergyGains:
-        """Return the gains and tangents of a function at the middle of a step.
-
-        It is a function of the dynamics, the decay by drag, and factors of velocities and spins.
-        """
-
-        def gains(scene: ReducedScene, velocity: Array, spin: Array) -> Array:
-            dynamics = DSMCDynamics(scene, self.scheme)
-            decay = dynamics.drag_decay(middle)
-            faster, turning = jnp.exp(velocity), decay.spin * jnp.exp(spin)
-            if scene.surface is not None:  # at a given energy a larger inertia has smaller spins
-                inertia = scene.surface.inertia
-                turning = turning * jnp.sqrt(jax.lax.stop_gradient(inertia) / inertia)
-            return gained(dynamics, decay, faster, turning)
-
-        zero = jnp.zeros_like(middle)
-        values, pull = jax.vjp(gains, self.scene, zero, zero)
-
-        def row(weights):
-            in_scene, *in_motion = pull(weights)
-            return jnp.concatenate([slopes_along(in_scene, directions), jnp.stack(in_motion)])
-
-        return values, jax.vmap(row)(jnp.eye(2, dtype=zero.dtype)).T
-
-
-def advance(
-    dynamics: DSMCDynamics,
-    state: DSMCState,
-    end: Float[Array, ""],
-    key: UInt32[Array, "2"],
-    max_steps: Int[Array, ""],
-    in_part: Bool[Array, ""],
-) -> DSMCState:
-    """Advance each replica by whole steps to the last one that ends before a time.
-
-    Or do one step in part, exactly up to this time, which whole steps have reached: both are one
-    program, because the step takes nearly all of the time of its compilation.
-
-    Args:
-        dynamics: of the gas.
-        state: the initial state.
-        end: the time.
-        key: two 32-bit words of a key of random numbers.
-        max_steps: maximum number of whole steps; `time` of the result is the time that they reach.
-        in_part: whether to do the step in part.
-    """
-    scene, length, num = dynamics.scene, dynamics.step_length, dynamics.scheme.candidates
-    max_steps = jnp.where(in_part, 1, max_steps)
-
-    def left(state):
-        return (end - state.clock) - state.clock_rest
-
-    def due(state):
-        return length(state) <= left(state)
-
-    def unfinished(carry):
-        state, steps_left = carry
-        return (in_part | jnp.any(due(state))) & (steps_left > 0)
-
-    def step_due(carry):
-        state, steps_left = carry
-        share = due(state).astype(state.clock.dtype)
-        if scene.drive is not None or scene.walls is not None:
-            share = share * length(state) / dynamics.full_step(state)
-        part = jnp.clip(left(state) / dynamics.full_step(state), 0.0, 1.0)
-        # A step ends with its last candidate, which does not happen within the step.
-        chance = jnp.where(in_part, part * (1 - 1 / num), share)
-        return dynamics.step(state, key, jnp.where(in_part, part, share), chance), steps_left - 1
-
-    state, _ = jax.lax.while_loop(unfinished, step_due, (state, max_steps))
-    time = jnp.where(jnp.any(due(state)), jnp.min(state.clock), end)
-    return state._replace(time=jnp.maximum(time, state.time))

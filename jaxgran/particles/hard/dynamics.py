@@ -6,7 +6,7 @@ each window begins and ends with half of its kicks. Units as in `jaxgran.particl
 
 import dataclasses
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,42 +14,38 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, UInt32
 
 from jaxgran._utils import status
-from jaxgran.gradients import rule
-from jaxgran.gradients.tangents import ExchangeTangents, ImpactTangents
+from jaxgran.gradients.rule import Records
+from jaxgran.gradients.tangents import ExchangeTangents
 from jaxgran.particles import neighbours
 from jaxgran.particles.capacity import Capacity
-from jaxgran.particles.dynamics import (
-    FATAL,
-    AbstractDynamics,
-    Progress,
-    initial_progress,
-    repeat_until,
+from jaxgran.particles.elements import (
+    MAX_KICK,
+    drag_decay,
+    exchange_slopes,
+    kick_variance,
+    random_kicks,
+    threefry_key,
 )
 from jaxgran.particles.hard.impacts import MAX_ROUNDS, ImpactWork, execute_impacts
 from jaxgran.particles.hard.prediction import ImpactCandidates, PairRows, Paths, first_impacts
 from jaxgran.particles.neighbours import Pairs, rows_where, select_members
-from jaxgran.particles.setup import allowed_overlap, min_distance
-from jaxgran.particles.state import (
-    MAX_KICK,
-    State,
+from jaxgran.particles.spheres import (
+    FATAL,
+    AbstractSphereDynamics,
+    Segment,
+    SphereState,
     advance_time,
-    common_records,
-    derivatives_of_records,
-    drag_decay,
-    exchange_derivatives,
+    common_values,
     fastest,
-    initial_spins,
-    kick_variance,
     kinetic_energy,
-    random_kicks,
+    repeat_until,
     temperature,
-    threefry_key,
     time_left,
+    with_dissipated_energy,
 )
+from jaxgran.particles.start import initial_spins
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.gas import ReducedScene, SphereScene
-from jaxgran.scene.laws import ReducedLaw
-from jaxgran.theory import averages
 
 MIN_IMPACTS = 8
 """Smallest number of impacts that a window should have, in all replicas together."""
@@ -70,8 +66,12 @@ MIN_SKIN = 0.2
 """Skin in diameters below which it is not shortened."""
 
 
+ALLOWED_OVERLAP = 1e-9
+"""Overlap in diameters that is allowed in a given start."""
+
+
 class HardState(NamedTuple):
-    """Internal state of hard spheres, see `State`.
+    """Internal state of hard spheres, see `SphereState`.
 
     Attributes:
         age: time since the last impact.
@@ -90,11 +90,11 @@ class HardState(NamedTuple):
     key: UInt32[Array, "3"] | None = None
 
 
-class HardDynamics(AbstractDynamics):
-    """Dynamics of hard spheres in windows of time.
+class HardDynamics(AbstractSphereDynamics):
+    """Hard spheres in windows of time.
 
     Attributes:
-        scene, replicas, capacity: see `AbstractDynamics`.
+        scene, shape, capacity, crowded, listed_by_skin, engine: see `AbstractSphereDynamics`.
         share: impacts per particle in a window.
         contact_time: in mean free times; the impact of a sphere within this time of its last one is
             elastic.
@@ -102,74 +102,73 @@ class HardDynamics(AbstractDynamics):
     """
 
     scene: SphereScene
-    replicas: int = eqx.field(static=True)
+    shape: tuple[int, int, int] = eqx.field(static=True)
     capacity: Capacity = eqx.field(static=True)
+    crowded: Capacity = eqx.field(static=True)
+    listed_by_skin: float = eqx.field(static=True)
+    engine: str = eqx.field(static=True)
     share: float = eqx.field(static=True)
     contact_time: Float[Array, ""]
     all_elastic: Bool[Array, ""]
 
-    def initial_internal(self, num_rows, dtype) -> HardState:
+    def elastic(self) -> "HardDynamics":
+        """Return the dynamics of smooth elastic spheres, between such walls, without drag.
+
+        A drag without effect leaves smooth spheres the program of the run.
+        """
+        material = self.scene.material
+        walls = material.walls
+        if walls is not None:
+            walls = walls._replace(surface=None)
+        drag = jax.tree.map(lambda x: 0 * x, material.drag)
+        material = material._replace(surface=None, walls=walls, drag=drag, drive=None)
+        scene = self.scene._replace(material=material)
+        return dataclasses.replace(self, scene=scene, all_elastic=jnp.ones((), bool))
+
+    def initial_internal(self, velocity: Float[Array, "n d"], key: PRNGKeyArray) -> HardState:
+        dtype = velocity.dtype
+        material = self.scene.material
         # The first window is short: at random positions many spheres are near contact.
         rate = self.scene.collision_frequency
         if self.region is not None:
             rate = rate + 2 / jnp.min(self.region)
+        spin = gain = counted_key = None
+        if material.surface is not None:
+            mean_square = (material.surface.ratio / material.surface.inertia).astype(dtype)
+            spin = initial_spins(key, self.shape, mean_square)
+            gain = jnp.zeros(self.replicas, dtype)
+        if material.drive is not None:
+            words = jax.random.bits(jax.random.fold_in(key, 3), (2,), jnp.uint32)
+            counted_key = jnp.concatenate([words, jnp.zeros(1, jnp.uint32)])
         return HardState(
-            age=jnp.full(num_rows, jnp.inf, dtype),
+            age=jnp.full(len(velocity), jnp.inf, dtype),
             regularised=jnp.zeros(self.replicas, jnp.result_type(int)),
             window=jnp.asarray(self.share / (8 * rate), dtype),
+            spin=spin,
+            rotational_gain=gain,
+            key=counted_key,
         )
 
-    def elastic(self) -> "HardDynamics":
+    def initial_tangents(self, state: SphereState, directions: ReducedScene) -> ExchangeTangents:
         material = self.scene.material
-        drag, drive = jax.tree.map(lambda x: 0 * x, (material.drag, material.drive))
-        scene = self.scene._replace(material=material._replace(drag=drag, drive=drive))
-        return dataclasses.replace(self, scene=scene, all_elastic=jnp.ones((), bool))
+        return ExchangeTangents.initial(directions, material, state.velocity, self.replicas)
 
-    def sample_spins(self, state: State, key: PRNGKeyArray) -> State:
-        internal, surface = state.internal, self.scene.material.surface
-        if surface is not None:
-            mean_square = surface.ratio / surface.inertia
-            spin = initial_spins(key, state.velocity, self.replicas, mean_square)
-            gain = jnp.zeros(self.replicas, spin.dtype)
-            internal = internal._replace(spin=spin, rotational_gain=gain)
-        if self.scene.material.drive is not None:
-            words = jax.random.bits(jax.random.fold_in(key, 3), (2,), jnp.uint32)
-            internal = internal._replace(key=jnp.concatenate([words, jnp.zeros(1, jnp.uint32)]))
-        return state._replace(internal=internal)
+    def true_velocities(self, state: SphereState) -> tuple[Array, Array | None]:
+        decay = drag_decay(self.scene.drag_rates, state.time + state.time_rest)
+        spin = state.internal.spin
+        return state.velocity * decay.velocity, None if spin is None else spin * decay.true_spin
 
-    def to_lab_frame(self, state: State, velocity: Array) -> tuple[Array, Array | None]:
-        spin, drag = state.internal.spin, self.scene.drag_rates
-        if drag is None:
-            return velocity, spin
-        decay = drag_decay(drag, state.time + state.time_rest)
-        return velocity * decay.velocity, None if spin is None else spin * decay.true_spin
-
-    def with_tangents(self, state: State, directions: ReducedScene) -> State:
-        material, velocity, replicas = self.scene.material, state.velocity, self.replicas
-        if material.has_elements:
-            tangents = ExchangeTangents.initial(directions, material, velocity, replicas)
-        else:
-            tangents = ImpactTangents.initial(directions.law, replicas, velocity.dtype)
-        return state._replace(tangents=tangents)
-
-    def observe(self, state: State) -> dict[str, Array]:
+    def observe(self, state: SphereState) -> Records:
         return hard_records(state, self.scene, self.replicas)
 
-    def check_start(self, state: State) -> Int[Array, ""]:
-        x, side = state.position, self.scene.side
-        closest = min_distance(x, side, self.replicas, self.capacity[:2], "sweep")
-        if (container := self.scene.container) is not None:  # a sphere and its image beyond a wall
-            image = 2 * jnp.min(jnp.minimum(x, container[None] - x))
-            closest = jnp.minimum(closest, image)
-        return status.flag(status.OVERLAPPING, closest < 1 - allowed_overlap(x, side))
-
     @jax.jit
-    def prepare(self, state: State, end: ArrayLike) -> tuple[State, Array, Array]:
+    def prepare(self, state: SphereState, end: ArrayLike) -> tuple[SphereState, Array, Array]:
         """Prepare a neighbour list of the positions in the middle of its life.
 
         Free flight leads there, and the list lives twice as long as one of the current positions.
         """
-        side, container = self.scene.side, self.scene.container
+        side = self.scene.side
+        container = self.scene.container
         speed = jnp.max(fastest(state.velocity, self.replicas))
         life = 0.95 * state.skin / jnp.maximum(speed, jnp.finfo(speed.dtype).tiny)
         time_until_end = time_left(state, end)
@@ -182,23 +181,40 @@ class HardDynamics(AbstractDynamics):
         prepared = state._replace(position=listed - flown, image=state.image + image)
         return prepared, listed, jnp.where(life < time_until_end, state.time + life, end)
 
-    def advance(
-        self, state: State, listed: Float[Array, "n d"], pairs: Pairs, end: ArrayLike
-    ) -> Progress:
+    def run_blocks(
+        self, state: SphereState, listed: Float[Array, "n d"], pairs: Pairs, end: ArrayLike
+    ) -> Segment:
+        overlapping = jax.lax.cond(
+            state.fresh, lambda: self._overlaps(state, pairs), lambda: jnp.zeros((), bool)
+        )
+        fault = state.status | status.flag(status.OVERLAPPING, overlapping)
         bound_factor = jnp.ones((), state.position.dtype)
-        first = initial_progress(state, pairs, self.capacity, bound_factor)
-        window = partial(self._advance_window, listed=listed, pairs=pairs, end=end)
+        first = Segment(state._replace(status=fault), jnp.zeros((), bool), bound_factor)
+        window = partial(self._run_window, listed=listed, pairs=pairs, end=end)
         return repeat_until(end, window, first)
 
-    def _advance_window(
-        self, now: Progress, listed: Array, pairs: Pairs, end: ArrayLike
-    ) -> Progress:
+    def _overlaps(self, state: SphereState, pairs: Pairs) -> Bool[Array, ""]:
+        """Return whether spheres of a start overlap others or a wall by more than rounding."""
+        x = state.position
+        side = self.scene.side
+        container = self.scene.container
+        separation = x[pairs.i] - x[pairs.j] - pairs.offset
+        square = jnp.sum(separation * separation, -1)
+        in_use = jnp.arange(len(square)) < pairs.count
+        closest = jnp.sqrt(jnp.min(jnp.where(in_use, square, 1.0), initial=1.0))
+        if container is not None:  # a sphere and its image beyond a wall
+            closest = jnp.minimum(closest, 2 * jnp.min(jnp.minimum(x, container[None] - x)))
+        return closest < 1 - allowed_overlap(x.dtype, side)
+
+    def _run_window(self, now: Segment, listed: Array, pairs: Pairs, end: ArrayLike) -> Segment:
         """Run one window, and accept it if no sphere exceeded the speed bound and no check failed.
 
-        `Progress.internal` is the factor by which the bound on speeds is raised.
+        `Segment.retry` is the factor by which the bound on speeds is raised.
         """
-        old, bound_factor = now.state, now.internal
-        time_until_end, scene = time_left(old, end), self.scene
+        old = now.state
+        bound_factor = now.retry
+        time_until_end = time_left(old, end)
+        scene = self.scene
         window = self._window_length(old)
         num_left = jnp.maximum(jnp.ceil(time_until_end / window * (1 - 1e-9)), 1.0)
         duration = time_until_end / num_left
@@ -220,21 +236,21 @@ class HardDynamics(AbstractDynamics):
         fault |= status.flag(status.STALLED, work.num_rounds >= MAX_ROUNDS)
         invalid = self.invalid_block(new, candidates.needed)
         fault = jnp.where(invalid > 0, invalid, fault)
-        accepted, repeat = (fault == status.OK) & ~too_fast, too_fast & (invalid == 0)
+        accepted = (fault == status.OK) & ~too_fast
+        repeat = too_fast & (invalid == 0)
         state = jax.tree.map(partial(jnp.where, accepted), new, old)
         next_duration = jnp.minimum(state.internal.window, time_left(state, end))
         next_position = state.position + state.velocity * next_duration
         next_distance2 = jnp.max(jnp.sum((next_position - listed) ** 2, -1))
-        return Progress(
-            state=state,
+        fault = jnp.where(repeat, status.OK, fault).astype(jnp.int32)
+        return Segment(
+            state=state._replace(status=fault, needed=jnp.maximum(old.needed, candidates.needed)),
             stale=accepted & (next_distance2 > (0.5 * old.skin) ** 2),
-            status=jnp.where(repeat, status.OK, fault).astype(jnp.int32),
-            needed=jnp.maximum(now.needed, candidates.needed),
-            internal=jnp.where(repeat, 1.3 * bound_factor, 1.0),
+            retry=jnp.where(repeat, 1.3 * bound_factor, 1.0),
         )
 
     def _select_candidates(
-        self, state: State, pairs: Pairs, duration: Array, bound: Float[Array, "replicas"]
+        self, state: SphereState, pairs: Pairs, duration: Array, bound: Float[Array, "replicas"]
     ) -> ImpactCandidates:
         """Select the pairs that touch in free flight, and all that may touch once paths have
         changed. Particles that reach a wall are members, too.
@@ -245,8 +261,11 @@ class HardDynamics(AbstractDynamics):
             duration: of the window.
             bound: an upper bound on the speeds in each replica during the window.
         """
-        x, v, container = state.position, state.velocity, self.scene.container
-        n, size = len(x), len(x) // len(bound)
+        x = state.position
+        v = state.velocity
+        container = self.scene.container
+        n = len(x)
+        size = len(x) // len(bound)
         # The listed pairs that can touch at the largest speeds are a small part of the list.
         displacement = x[pairs.i] - x[pairs.j] - pairs.offset
         gap = jnp.sqrt(jnp.sum(displacement * displacement, -1)) - 1
@@ -254,7 +273,9 @@ class HardDynamics(AbstractDynamics):
         near, num_near = rows_where(gap < 2 * bound[pairs.i // size] * duration, self.capacity.near)
         real = jnp.arange(self.capacity.near) < num_near
         near = jnp.where(real, near, 0)
-        i, j, offset = pairs.i[near], pairs.j[near], pairs.offset[near]
+        i = pairs.i[near]
+        j = pairs.j[near]
+        offset = pairs.offset[near]
         rows = PairRows(i, j, offset, bound[i // size], real)
 
         free = first_impacts(Paths(x, v, jnp.zeros(n, x.dtype)), rows, duration, container)
@@ -270,8 +291,8 @@ class HardDynamics(AbstractDynamics):
         return ImpactCandidates(members, rows, members // size, needed)
 
     def _state_after_window(
-        self, state: State, candidates: ImpactCandidates, work: ImpactWork, duration: Array
-    ) -> State:
+        self, state: SphereState, candidates: ImpactCandidates, work: ImpactWork, duration: Array
+    ) -> SphereState:
         """Return the state after a window at its old time, with the length of the next window."""
 
         def by_replica(values):
@@ -280,13 +301,15 @@ class HardDynamics(AbstractDynamics):
         def to_members(values, new):
             return values.at[candidates.members].set(new, mode="drop")
 
-        impacts, lost = by_replica(work.impacts) // 2, by_replica(work.dissipated)
+        impacts = by_replica(work.impacts) // 2
+        lost = by_replica(work.dissipated)
         wanted = max(0.5 * self.share * len(state.position), MIN_IMPACTS)
         num_impacts = jnp.sum(impacts)
         if work.wall_impacts is not None:  # each of one sphere, not of two
             num_impacts = num_impacts + jnp.sum(work.wall_impacts) / 2
         ratio = jnp.clip((wanted / jnp.maximum(num_impacts, 1)) ** WINDOW_EXPONENT, 0.5, 1.5)
-        paths, internal = work.paths, state.internal
+        paths = work.paths
+        internal = state.internal
         regularised = internal.regularised + by_replica(work.regularised) // 2
         rotational_gain = None
         if work.rotational_gain is not None:
@@ -312,29 +335,30 @@ class HardDynamics(AbstractDynamics):
             return new
         return new._replace(tangents=self._tangents_after(state, new, candidates, work, duration))
 
-    def recover(self, now: Progress, before: State) -> tuple[State, Int[Array, ""]]:
+    def recover(self, now: Segment, before: SphereState) -> SphereState:
         """Shorten the window if the skin was exceeded at once, and the skin of a crowded list."""
         state = now.state
         fresh = state.time == before.time  # otherwise a new neighbour list is enough
-        shorten = status.has(now.status, status.SKIN_EXCEEDED) & fresh
+        shorten = status.has(state.status, status.SKIN_EXCEEDED) & fresh
         # Only with enough capacity, so that a resumed run with another capacity does the same.
-        crowded = now.needed[0] > MAX_LISTED_PER_PARTICLE * len(state.position)
-        crowded &= now.status == status.OK
+        crowded = state.needed[0] > MAX_LISTED_PER_PARTICLE * len(state.position)
+        crowded &= state.status == status.OK
         shorter = jnp.maximum(0.8 * state.skin, jnp.minimum(state.skin, MIN_SKIN))
         window = jnp.where(shorten, 0.5 * state.internal.window, state.internal.window)
-        recovered = state._replace(
+        return state._replace(
             skin=jnp.where(crowded, shorter, state.skin),
             internal=state.internal._replace(window=window),
+            status=state.status & FATAL,
         )
-        return recovered, now.status & FATAL
 
-    def _apply_drive(self, state: State, duration: ArrayLike, place: float) -> State:
+    def _apply_drive(self, state: SphereState, duration: ArrayLike, place: float) -> SphereState:
         """Return the state with half of the kicks of a window, at its begin (place 0) or end (1).
 
         Time and window are those before the window; the velocities may already have had kicks.
         """
-        counted_key, replicas = state.internal.key, self.replicas
-        if self.scene.material.drive is None or counted_key is None:
+        counted_key = state.internal.key
+        replicas = self.replicas
+        if counted_key is None:
             return state
         variance = drive_variance(self.scene, state.time + state.time_rest, duration, place)
         key = jax.random.fold_in(threefry_key(counted_key[:2]), counted_key[2])
@@ -346,11 +370,12 @@ class HardDynamics(AbstractDynamics):
         internal = state.internal._replace(key=counted_key.at[2].add(jnp.uint32(1)))
         return state._replace(velocity=velocity, internal=internal)
 
-    def _window_length(self, state: State) -> Float[Array, ""]:
+    def _window_length(self, state: SphereState) -> Float[Array, ""]:
         """Return a length with which the kicks of a window are small beside the velocities."""
         if self.scene.material.drive is None:
             return state.internal.window
-        lowest, time = jnp.min(temperature(state.velocity, self.replicas)), state.time
+        lowest = jnp.min(temperature(state.velocity, self.replicas))
+        time = state.time
         growth = 2 * drive_variance(self.scene, time + state.time_rest, jnp.ones_like(lowest), 0.0)
         safe_growth = jnp.where(growth > 0, growth, 1.0)
         longest = jnp.where(growth > 0, MAX_KICK * lowest / safe_growth, jnp.inf)
@@ -358,15 +383,17 @@ class HardDynamics(AbstractDynamics):
 
     def _tangents_after(
         self,
-        old: State,
-        new: State,
+        old: SphereState,
+        new: SphereState,
         candidates: ImpactCandidates,
         work: ImpactWork,
         duration: Array,
-    ) -> ImpactTangents | ExchangeTangents:
+    ) -> ExchangeTangents:
         """Return the tangents after a window, from the states before and after it."""
-        tangents, scene, replicas = old.tangents, self.scene, self.replicas
-        n, d = len(new.velocity) // replicas, new.velocity.shape[1]
+        tangents = old.tangents
+        scene = self.scene
+        replicas = self.replicas
+        material = scene.material
         lost = _sum_by_replica(work.dissipated, candidates, replicas)
         impacts = _sum_by_replica(work.impacts, candidates, replicas)
         replica = candidates.replica
@@ -375,33 +402,39 @@ class HardDynamics(AbstractDynamics):
             of_gains = jnp.concatenate([of_gains, replica])
         gains = jnp.zeros((*work.gains.shape[:-1], replicas), lost.dtype)
         gains = gains.at[..., of_gains].add(work.gains, mode="drop")
-        if isinstance(tangents, ImpactTangents):
-            T = temperature(new.velocity, replicas)
-            energy, trend = 0.5 * d * n * T, cooling_trend(scene.material.law, T, d)
-            rates = tangents.rates.after(
-                lost, impacts / n, energy, T, trend, duration, scene.collision_frequency
-            )
-            return tangents.after(gains, energy + 0.5 * lost, T, duration, rates, trend, d)
-        zero = jnp.zeros(replicas)
-        before, gained = jnp.stack([kinetic_energy(old.velocity, replicas), zero]), -lost[None]
-        gained = jnp.concatenate([gained, jnp.zeros_like(gained)])
+        before = [kinetic_energy(old.velocity, replicas)]
+        gained = [-lost]
         if work.rotational_gain is not None:
             spins = jnp.sum(old.internal.spin.reshape(replicas, -1) ** 2, axis=1)
-            before = before.at[1].set(scene.material.surface.inertia / 2 * spins)
-            gained = gained.at[1].set(_sum_by_replica(work.rotational_gain, candidates, replicas))
-        if scene.material.drive is not None:
+            before.append(material.surface.inertia / 2 * spins)
+            gained.append(_sum_by_replica(work.rotational_gain, candidates, replicas))
+        num_energies = len(gained)
+        by_direction = gains[:-num_energies]
+        by_scale = gains[-num_energies:]
+        if material.drive is not None:
 
             def heating(material: ReducedScene) -> Array:
-                changed, start = scene._replace(material=material), old.time + old.time_rest
+                changed = scene._replace(material=material)
+                start = old.time + old.time_rest
                 first, second = (drive_variance(changed, start, duration, k) for k in (0.0, 1.0))
-                return n * d / 2 * (first + second)
+                return old.velocity.size / replicas / 2 * (first + second)
 
-            heat, linear = jax.linearize(heating, scene.material)
+            heat, linear = jax.linearize(heating, material)
+            by_direction = by_direction.at[:, 0].add(jax.vmap(linear)(tangents.directions)[:, None])
             # Heating does not depend on the speeds, unlike the frequency of impacts.
-            gains = gains.at[:-2, 0].add(jax.vmap(linear)(tangents.directions)[:, None])
-            gains = gains.at[-2, 0].add(-heat)
-            gained = gained.at[0].add(heat)
-        return tangents.after(before, gained, gains, impacts / 2)
+            by_scale = by_scale.at[0, 0].add(-heat)
+            gained[0] = gained[0] + heat
+        return tangents.after(
+            jnp.stack(before), jnp.stack(gained), by_direction, by_scale, impacts / 2
+        )
+
+
+def allowed_overlap(dtype: Any, side: Any) -> Any:
+    """Return the overlap up to which spheres of a start count as hard.
+
+    It is at least the overlap of spheres in contact by rounding of positions.
+    """
+    return jnp.maximum(ALLOWED_OVERLAP, 10 * side * jnp.finfo(dtype).eps)
 
 
 def drive_variance(
@@ -412,17 +445,6 @@ def drive_variance(
     return kick_variance(strength, scene.drag_rates, start, jnp.asarray(duration), place)
 
 
-def cooling_trend(
-    law: ReducedLaw, temperature: Float[Array, "replicas"], dimension: int
-) -> Float[Array, "replicas"]:
-    """Return the cooling rate of a Maxwellian gas as a function of T, up to a factor."""
-
-    def rate(speed):
-        return averages.impact_moments(law, speed, dimension)[0, 0] * speed
-
-    return jax.vmap(rate)(jnp.sqrt(temperature))
-
-
 def _sum_by_replica(values: Array, candidates: ImpactCandidates, replicas: int) -> Array:
     """Return the sums over the slots of each replica; an empty slot belongs to none."""
     sums = jnp.zeros(replicas, values.dtype)
@@ -430,39 +452,53 @@ def _sum_by_replica(values: Array, candidates: ImpactCandidates, replicas: int) 
 
 
 @partial(jax.jit, static_argnames="replicas")
-def hard_records(state: State, scene: SphereScene, replicas: int) -> dict[str, Array]:
-    """Return the records of a state; with tangents, also those that `rule.with_tangents` adds.
+def hard_records(state: SphereState, scene: SphereScene, replicas: int) -> Records:
+    """Return the records of a state.
 
     In a scene with elements the dissipated energy includes all losses in impacts and to drag.
     """
-    values, displacement, velocity = common_records(state, scene, replicas)
-    material, tangents, (n, d) = scene.material, state.tangents, velocity.shape[1:]
+    values, velocity = common_values(state, scene, replicas)
+    material = scene.material
+    tangents = state.tangents
+    (n, d) = velocity.shape[1:]
     values["regularised"] = 2 / n * state.internal.regularised
+    if material.has_elements:
+        values |= _values_with_elements(state, scene, values)
+    if tangents is None:
+        return Records(values, {}, {})
+    drag_directions = jax.tree.map(
+        lambda x: x * scene.collision_frequency, tangents.directions.drag
+    )
+    time = state.time + state.time_rest
+    rates, slopes = exchange_slopes(
+        values, tangents, scene.drag_rates, drag_directions, time, (n, d)
+    )
     if not material.has_elements:
-        if tangents is None:
-            return values
-        T = values["temperature"]
-        cooling = tangents.rates.cooling(cooling_trend(material.law, T, d))
-        derivatives, rates = derivatives_of_records(
-            values, displacement, velocity, tangents, cooling
-        )
-        return rule.with_tangents(values, derivatives, rates, tangents.clock)
-    velocity_factor, spin_factor, drag = jnp.ones(()), jnp.ones(()), scene.drag_rates
-    if drag is not None:
-        velocity_factor, _, spin_factor = drag_decay(drag, state.time + state.time_rest)
+        rates, slopes = (with_dissipated_energy(x, d) for x in (rates, slopes))
+    return Records(values, rates, slopes)
+
+
+def _values_with_elements(
+    state: SphereState, scene: SphereScene, values: dict[str, Array]
+) -> dict[str, Array]:
+    """Return the records that drag changes, and those of rotation."""
+    replicas = len(values["temperature"])
+    n = len(state.velocity) // replicas
+    d = state.velocity.shape[1]
+    decay = drag_decay(scene.drag_rates, state.time + state.time_rest)
+    velocity_factor = decay.velocity
+    spin_factor = decay.true_spin
     initial = kinetic_energy(state.first_velocity, replicas) / n
     lost = initial - velocity_factor**2 * (initial - state.dissipated / n)
-    values["temperature"] = values["temperature"] * velocity_factor**2
-    values["velocity_correlation"] = values["velocity_correlation"] * velocity_factor
+    changed = {
+        "temperature": values["temperature"] * velocity_factor**2,
+        "velocity_correlation": values["velocity_correlation"] * velocity_factor,
+    }
     if state.internal.spin is not None:  # None in equilibration
+        surface = scene.material.surface
         square = jnp.mean(state.internal.spin.reshape(replicas, -1) ** 2, axis=1)
-        values["rotational_temperature"] = material.surface.inertia * square * spin_factor**2
-        initial = NUM_SPIN_COMPONENTS[d] / 2 * material.surface.ratio
+        changed["rotational_temperature"] = surface.inertia * square * spin_factor**2
+        initial = NUM_SPIN_COMPONENTS[d] / 2 * surface.ratio
         kept = spin_factor**2 * (initial + state.internal.rotational_gain / n)
         lost = lost + initial - kept
-    values["dissipated_energy"] = lost
-    if tangents is None:
-        return values
-    drag_along = jax.tree.map(lambda x: x * scene.collision_frequency, tangents.directions.drag)
-    time = state.time + state.time_rest
-    return values | exchange_derivatives(values, tangents, drag, drag_along, time, (n, d))
+    return changed | {"dissipated_energy": lost}

@@ -2,12 +2,11 @@
 
 Units here: the diameter, the mass and the first temperature are 1. Times and positions count as in
 `jaxgran.particles.hard.prediction`: an impact changes both the velocity of a path and its position
-extrapolated back to the start of the window. With drag, velocities, spins and time are transformed:
-see `jaxgran.particles.state`. Spins here are then the transformed ones, which drag does not change.
+extrapolated back to the start of the window. With drag, velocities, spins and time are transformed
+(`jaxgran.particles.elements`), and drag does not change the transformed spins.
 
-For tangents see `jaxgran.gradients.tangents`. The tangents of a scene with elements follow the
-energy that each impact exchanges, as a function of the numbers of the material and of the scale of
-all velocities and spins.
+Tangents (`jaxgran.gradients.tangents`) follow the energy that each impact exchanges, as a function
+of the numbers of the material and of the scale of all velocities and spins.
 """
 
 from functools import partial
@@ -17,9 +16,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxgran.gradients.tangents import ExchangeTangents, ImpactTangents
+from jaxgran.gradients.tangents import ExchangeTangents
+from jaxgran.particles.elements import drag_decay, tangential_impulse
 from jaxgran.particles.hard.prediction import ImpactCandidates, Paths, first_impacts
-from jaxgran.particles.state import State, drag_decay, tangential_impulse, temperature
+from jaxgran.particles.spheres import SphereState, temperature
 from jaxgran.scene.elements import wall_impact_ratio
 from jaxgran.scene.gas import ReducedScene, SphereScene
 
@@ -73,30 +73,36 @@ def impact_effect(
     tangent knows neither the positions of walls nor those of spheres, but only how often a gas
     meets the walls: energies at walls have a factor of value 1 that carries this dependence.
     """
-    material, speed = scene.material, impact.speed
-    law, surface, share = material.law, material.surface, 0.5
+    material = scene.material
+    speed = impact.speed
+    law = material.law
+    surface = material.surface
+    share = 0.5
     if axis is not None:
-        law, share = material.walls.law, 1.0  # a wall takes no part of the change of velocity
-    decay = None if material.drag is None else drag_decay(scene.drag_rates, impact.time)
+        law = material.walls.law
+        share = 1.0  # a wall takes no part of the change of velocity
+    decay = drag_decay(scene.drag_rates, impact.time)
     law_speed = speed * 0.5**0.5  # the law's unit of speed is sqrt(2)
-    eps = law.restitution(law_speed if decay is None else law_speed * decay.velocity)
+    eps = law.restitution(law_speed * decay.velocity)
     eps = jnp.where(impact.elastic, 1.0, eps)
     push = share * (1 + eps) * speed
-    kick, lost = -push[:, None] * impact.normal, share**2 / 2 * (1 - eps**2) * speed**2
+    kick = -push[:, None] * impact.normal
+    lost = share**2 / 2 * (1 - eps**2) * speed**2
     spin_change = rotational_gain = None
     if surface is not None and impact.spin is not None:
         spin_change = jnp.zeros_like(impact.spin)
         rotational_gain = spin_change[:, 0]
         if axis is None or material.walls.surface is not None:
             eta = surface.eta if axis is None else surface.eta_on_wall(material.walls.surface)
-            spin_factor = 1.0 if decay is None else decay.spin[:, None]
+            spin_factor = decay.spin[:, None]
             spin = impact.spin * spin_factor
             push = -jnp.sum(kick * impact.normal, -1)
             sideways, sliding_kick, added_spin = tangential_impulse(
                 impact.relative, spin, impact.normal, ~impact.elastic, eta, surface, push
             )
             with_half = sideways + 0.5 / share * sliding_kick
-            kick, lost = kick + sliding_kick, lost - share * jnp.sum(sliding_kick * with_half, -1)
+            kick = kick + sliding_kick
+            lost = lost - share * jnp.sum(sliding_kick * with_half, -1)
             spin_change = added_spin / spin_factor
             doubled = impact.spin * 2 * share + spin_change
             rotational_gain = surface.inertia / 2 * jnp.sum(spin_change * doubled, -1)
@@ -115,31 +121,37 @@ def exchange_gains(
     impact: ImpactEvents,
     happens: Bool[Array, "rows"],
     axis: Int[Array, "rows"] | None = None,
-) -> Float[Array, "changes 2 rows"]:
-    """Return the tangents of the gains of both energies, as `ExchangeTangents.after` takes them."""
+) -> Float[Array, "changes energies rows"]:
+    """Return the tangents of the gain of each energy.
 
-    def energies(material: ReducedScene, velocity: Array, spin: Array) -> Array:
-        # All velocities and all spins are multiplied by exp(...).
-        if material.surface is not None:
+    They are along the directions of `tangents`, then in the logarithm of all velocities, and of all
+    spins where spheres rotate, as `ExchangeTangents.after` takes them.
+    """
+
+    def energies(material: ReducedScene, log_scales: Float[Array, "energies"]) -> Array:
+        factor = jnp.exp(log_scales[0])
+        scaled = impact._replace(relative=impact.relative * factor, speed=impact.speed * factor)
+        if material.surface is not None and impact.spin is not None:
             # At a given energy spins are smaller where the inertia is larger.
             inertia = scene.material.surface.inertia
-            spin = spin - 0.5 * jnp.log(material.surface.inertia / inertia)
-        factor = jnp.exp(velocity)
-        scaled = impact._replace(
-            relative=impact.relative * factor,
-            speed=impact.speed * factor,
-            spin=None if impact.spin is None else impact.spin * jnp.exp(spin),
-        )
-        _, lost, _, gain = impact_effect(scene._replace(material=material), scaled, axis)
-        gain = jnp.zeros_like(lost) if gain is None else gain
-        return jnp.where(happens, jnp.stack([-lost, gain]), 0.0)
+            log_spin = log_scales[1] - 0.5 * jnp.log(material.surface.inertia / inertia)
+            scaled = scaled._replace(spin=impact.spin * jnp.exp(log_spin))
+        effect = impact_effect(scene._replace(material=material), scaled, axis)
+        gained = [-effect.lost]
+        if effect.rotational_gain is not None:
+            gained.append(effect.rotational_gain)
+        return jnp.where(happens, jnp.stack(gained), 0.0)
 
-    zero, one = (jnp.full((), x, impact.speed.dtype) for x in (0.0, 1.0))
-    _, linear = jax.linearize(energies, scene.material, zero, zero)
-    no_direction = jax.tree.map(jnp.zeros_like, scene.material)
-    by_direction = jax.vmap(lambda direction: linear(direction, zero, zero))(tangents.directions)
-    by_scale = jnp.stack([linear(no_direction, one, zero), linear(no_direction, zero, one)])
-    return jnp.concatenate([by_direction, by_scale])
+    num_energies = tangents.energies.shape[1]
+    none = jnp.zeros(num_energies, impact.speed.dtype)
+    _, linear = jax.linearize(energies, scene.material, none)
+    num_directions = len(tangents.energies)
+    scales = jnp.concatenate([jnp.zeros((num_directions, num_energies)), jnp.eye(num_energies)])
+
+    def padded(directions: Array) -> Array:
+        return jnp.pad(directions, [(0, num_energies), *[(0, 0)] * (directions.ndim - 1)])
+
+    return jax.vmap(linear)(jax.tree.map(padded, tangents.directions), scales.astype(none.dtype))
 
 
 MAX_ROUNDS = 100_000
@@ -162,8 +174,7 @@ class ImpactWork(NamedTuple):
         pending: whether the last round executed an impact.
         num_rounds: number of rounds.
         gains: tangents of the energy gained in impacts of pairs, and of slots on walls if there are
-            walls, along directions in the material, see `ImpactTangents` and `exchange_gains`;
-            without tangents, no changes.
+            walls, see `exchange_gains`; without tangents, no changes.
     """
 
     paths: Paths
@@ -176,11 +187,11 @@ class ImpactWork(NamedTuple):
     max_speed2: Float[Array, "slots"]
     pending: Bool[Array, ""]
     num_rounds: Int[Array, ""]
-    gains: Float[Array, "changes *energies rows"]
+    gains: Float[Array, "changes energies rows"]
 
 
 def execute_impacts(
-    state: State,
+    state: SphereState,
     listed: Float[Array, "n d"],
     candidates: ImpactCandidates,
     scene: SphereScene,
@@ -208,7 +219,9 @@ def execute_impacts(
     def of_members(values):
         return values.at[candidates.members].get(mode="fill", fill_value=0.0)
 
-    internal, tangents, start_time = state.internal, state.tangents, state.time + state.time_rest
+    internal = state.internal
+    tangents = state.tangents
+    start_time = state.time + state.time_rest
     spin = None if internal.spin is None else of_members(internal.spin)
     x, v, listed = (of_members(values) for values in (state.position, state.velocity, listed))
     paths = Paths(x, v, -of_members(internal.age), spin)
@@ -217,14 +230,19 @@ def execute_impacts(
     T = jnp.maximum(T, jnp.finfo(T.dtype).tiny)
     contact_duration = contact_time / (scene.collision_frequency * jnp.sqrt(T))
     contact_duration = contact_duration[jnp.minimum(candidates.replica, replicas - 1)]
-    rows, slots = candidates.rows, jnp.arange(len(v), dtype=jnp.int32)
-    a, b, num_rows = rows.a, rows.b, len(rows.a)
+    rows = candidates.rows
+    slots = jnp.arange(len(v), dtype=jnp.int32)
+    a = rows.a
+    b = rows.b
+    num_rows = len(rows.a)
     index = jnp.arange(num_rows, dtype=jnp.int32)
 
     def one_round(work: ImpactWork) -> ImpactWork:
         paths = work.paths
         next_impacts = first_impacts(paths, rows, duration, scene.container)
-        times, first, final = next_impacts.times, next_impacts.first, next_impacts.final
+        times = next_impacts.times
+        first = next_impacts.first
+        final = next_impacts.final
         executable = jnp.isfinite(times)
         for k in (a, b):
             executable &= (times == first[k]) & (times == final[k])
@@ -243,24 +261,25 @@ def execute_impacts(
         events = ImpactEvents(start_time + s, -normal, next_impacts.w, speed, spin, elastic)
         effect = impact_effect(scene, events)
         gains = work.gains
-        if isinstance(tangents, ExchangeTangents):  # each of two loses half of the energy
+        if tangents is not None:  # each of two loses half of the energy
             more = 2 * exchange_gains(scene, tangents, events, executable)
             gains = gains.at[..., :num_rows].add(more)
-        elif tangents is not None:  # the law's unit of speed is sqrt(2)
-            more = 2 * tangents.gains(scene.material.law, events.speed * 0.5**0.5)
-            gains = gains + jnp.where((executable & ~too_soon & ~all_elastic)[None], more, 0.0)
 
         # From the rows of pairs to the slots of their spheres.
-        unpaired, row = row == num_rows, jnp.minimum(row, num_rows - 1)
+        unpaired = row == num_rows
+        row = jnp.minimum(row, num_rows - 1)
         hit = executable[row] & ((a[row] == slots) | (b[row] == slots))
         sign = jnp.where(hit, jnp.where(a[row] == slots, 1.0, -1.0), 0.0)
         effect = jax.tree.map(lambda x: x[row], effect)
         effect = effect._replace(kick=sign[:, None] * effect.kick)
-        s, too_soon = jnp.where(hit, s[row], 0.0), too_soon[row]
+        s = jnp.where(hit, s[row], 0.0)
+        too_soon = too_soon[row]
         x = paths.x - effect.kick * s[:, None]
-        impacts, wall_impacts = work.impacts + hit, work.wall_impacts
+        impacts = work.impacts + hit
+        wall_impacts = work.wall_impacts
         regularised = work.regularised + (hit & too_soon)
-        wall_times, axis = next_impacts.wall_times, next_impacts.wall_axis
+        wall_times = next_impacts.wall_times
+        axis = next_impacts.wall_axis
         if wall_times is not None and axis is not None and wall_impacts is not None:
             at_wall = unpaired & jnp.isfinite(wall_times)
             at_wall &= (wall_times == first) & (wall_times == final)
@@ -274,18 +293,21 @@ def execute_impacts(
                 start_time + wall_s, outwards, paths.v, speed, paths.spin, elastic
             )
             on_wall = impact_effect(scene, events, axis)
-            if isinstance(tangents, ExchangeTangents):
+            if tangents is not None:
                 more = exchange_gains(scene, tangents, events, at_wall, axis)
                 gains = gains.at[..., num_rows:].add(more)
             effect = jax.tree.map(partial(_where_rows, at_wall), on_wall, effect)
-            s, hit = jnp.where(at_wall, wall_s, s), hit | at_wall
+            s = jnp.where(at_wall, wall_s, s)
+            hit = hit | at_wall
             after = paths.x + paths.v * s[:, None] - (paths.v + effect.kick) * s[:, None]
             x = _where_rows(at_wall, after, x)
             wall_impacts = wall_impacts + at_wall
             # An impact of two spheres counts twice.
             regularised = regularised + 2 * (at_wall & too_soon)
 
-        v, spin, rotational_gain = paths.v + effect.kick, paths.spin, work.rotational_gain
+        v = paths.v + effect.kick
+        spin = paths.spin
+        rotational_gain = work.rotational_gain
         if spin is not None and rotational_gain is not None:
             spin = spin + _where_rows(hit, effect.spin_change, jnp.zeros_like(spin))
             rotational_gain = rotational_gain + jnp.where(hit, effect.rotational_gain, 0.0)
@@ -307,13 +329,13 @@ def execute_impacts(
     def unfinished(work: ImpactWork):
         return work.pending & (work.num_rounds < MAX_ROUNDS)
 
-    counts, zeros = jnp.zeros_like(slots), jnp.zeros(len(slots), paths.x.dtype)
-    shape = 0, num_rows
-    if isinstance(tangents, ImpactTangents):
-        shape = len(tangents.log_temperature) + 1, num_rows
-    elif tangents is not None:
+    counts = jnp.zeros_like(slots)
+    zeros = jnp.zeros(len(slots), paths.x.dtype)
+    shape = 0, 1, num_rows
+    if tangents is not None:
+        num_directions, num_energies, _ = tangents.energies.shape
         num_walls = 0 if scene.container is None else len(slots)
-        shape = len(tangents.energies) + 2, 2, num_rows + num_walls
+        shape = num_directions + num_energies, num_energies, num_rows + num_walls
     work = ImpactWork(
         paths=paths,
         dissipated=zeros,

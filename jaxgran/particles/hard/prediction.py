@@ -79,7 +79,8 @@ def next_wall_impacts(
     container: Float[Array, "d"], paths: Paths, end: ArrayLike
 ) -> tuple[Float[Array, "slots"], Int[Array, "slots"]]:
     """Return the times of the next impacts on walls, inf if there is none, and their axes."""
-    x, v = paths.x, paths.v
+    x = paths.x
+    v = paths.v
     target = jnp.where(v > 0, container[None] - 0.5, 0.5)
     moving = v != 0
     times_by_axis = jnp.where(moving, (target - x) / jnp.where(moving, v, 1.0), jnp.inf)
@@ -116,8 +117,10 @@ def first_impacts(
     paths: Paths, rows: PairRows, end: ArrayLike, container: Float[Array, "d"] | None = None
 ) -> FirstImpacts:
     """Return the next impact of each pair and of each particle before `end`."""
-    a, b = rows.a, rows.b
-    r, w = paths.x[a] - paths.x[b] - rows.offset, paths.v[a] - paths.v[b]
+    a = rows.a
+    b = rows.b
+    r = paths.x[a] - paths.x[b] - rows.offset
+    w = paths.v[a] - paths.v[b]
     motion = RelativeMotion(jnp.sum(r * r, -1), jnp.sum(r * w, -1), jnp.sum(w * w, -1))
     last = paths.last[a], paths.last[b]
     times = motion.impact_time(jnp.maximum(jnp.maximum(*last), 0.0))

@@ -1,4 +1,4 @@
-"""Dynamics of soft spheres in blocks of time steps, with records and tangents.
+"""Soft spheres in blocks of time steps, with records and tangents.
 
 Spheres that may touch are integrated by time steps; all others fly freely, which is exact. The
 pairs that may touch are selected once a block. Indices are thus fixed within a block, which keeps
@@ -16,17 +16,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, Shaped
 
 from jaxgran._utils import status
-from jaxgran.gradients import rule
-from jaxgran.gradients.tangents import ContactTangents, component_along, ratio_or_zero
+from jaxgran.gradients.rule import Records
+from jaxgran.gradients.tangents import ContactTangents, RateSums, component_along
 from jaxgran.particles import neighbours, observables
 from jaxgran.particles.capacity import Capacity, max_skin
-from jaxgran.particles.dynamics import (
-    FATAL,
-    AbstractDynamics,
-    Progress,
-    initial_progress,
-    repeat_until,
-)
 from jaxgran.particles.neighbours import Pairs, rows_where, select_members
 from jaxgran.particles.soft.forces import (
     PAIR,
@@ -40,18 +33,22 @@ from jaxgran.particles.soft.forces import (
     overlap,
     wall_overlap,
 )
-from jaxgran.particles.state import (
-    State,
+from jaxgran.particles.spheres import (
+    FATAL,
+    AbstractSphereDynamics,
+    Segment,
+    SphereState,
     advance_time,
     centred,
-    common_records,
-    derivatives_of_records,
+    common_values,
     fastest,
-    initial_spins,
     kinetic_energy,
     peculiar_velocity,
+    repeat_until,
     time_left,
+    with_dissipated_energy,
 )
+from jaxgran.particles.start import initial_spins
 from jaxgran.scene.gas import ReducedContact, ReducedScene, SphereScene
 from jaxgran.theory.equations import COOLING_CORRECTION
 
@@ -76,9 +73,12 @@ RECOVERY_BLOCKS = 200
 REACH_MARGIN = 1.5
 """Largest distance of a sphere in a block, over the free flight of the fastest sphere."""
 
+LOSS, COLLISIONS, ROTATION = range(3)
+"""Changes of which tangents have rates: energy lost, collisions, energy gained by rotation."""
+
 
 class SoftState(NamedTuple):
-    """Internal state of soft spheres, see `State`.
+    """Internal state of soft spheres, see `SphereState`.
 
     Attributes:
         elastic: energy in contacts.
@@ -95,8 +95,8 @@ class SoftState(NamedTuple):
     spin: Float[Array, "n spins"] | None = None
 
 
-class SoftProgress(NamedTuple):
-    """Progress of soft spheres within one neighbour list, see `Progress`.
+class SoftRetry(NamedTuple):
+    """What changes when a block is repeated, see `Segment`.
 
     Attributes:
         extra: particles whose contacts were detected only after a block had been integrated.
@@ -107,27 +107,44 @@ class SoftProgress(NamedTuple):
     reach_factor: Float[Array, ""]
 
 
-class SoftDynamics(AbstractDynamics):
-    """Dynamics of viscoelastic spheres in blocks of equal time steps.
+class IntegratedBlock(NamedTuple):
+    """A block, and what decides whether it is accepted.
 
     Attributes:
-        scene, replicas, capacity: see `AbstractDynamics`.
+        state: after the block, at the time before it.
+        lost: energy lost in contacts and to drag.
+        exchanged: work of the elastic forces, with all its parts counted as positive.
+        unexpected: particles that touched another one or a wall, although not all of their
+            neighbours belong to the candidates.
+        max_square_move: square of the largest distance that a member moved.
+    """
+
+    state: SphereState
+    lost: Float[Array, "replicas"]
+    exchanged: Float[Array, "replicas"]
+    unexpected: Bool[Array, "n"]
+    max_square_move: Float[Array, ""]
+
+
+class SoftDynamics(AbstractSphereDynamics):
+    """Viscoelastic spheres in blocks of equal time steps.
+
+    Attributes:
+        scene, shape, capacity, crowded, listed_by_skin, engine: see `AbstractSphereDynamics`.
         steps_per_contact: steps in the mean contact duration at the current temperature.
         steps_per_block: steps for which the candidates for contact are fixed.
         projection: mean free times between thermal projections of tangents.
     """
 
     scene: SphereScene
-    replicas: int = eqx.field(static=True)
+    shape: tuple[int, int, int] = eqx.field(static=True)
     capacity: Capacity = eqx.field(static=True)
+    crowded: Capacity = eqx.field(static=True)
+    listed_by_skin: float = eqx.field(static=True)
+    engine: str = eqx.field(static=True)
     steps_per_contact: int = eqx.field(static=True)
     steps_per_block: int = eqx.field(static=True)
     projection: Float[Array, ""]
-
-    def initial_internal(self, num_rows, dtype) -> SoftState:
-        # The elastic energy of the start is counted by the first `advance`.
-        zeros = jnp.zeros(self.replicas, dtype)
-        return SoftState(zeros, jnp.ones((), dtype), jnp.zeros((), jnp.int32), zeros)
 
     def elastic(self) -> "SoftDynamics":
         """Return the dynamics of smooth spheres without drag, between elastic walls."""
@@ -135,47 +152,57 @@ class SoftDynamics(AbstractDynamics):
         def lossless(law: ReducedContact) -> ReducedContact:
             return ReducedContact(law.alpha, 0.0 * law.alpha, law.clipped)
 
-        material = _with_laws(self.scene.material, lossless)
-        drag = jax.tree.map(lambda x: 0.0 * x, material.drag)
-        walls = material.walls and material.walls._replace(surface=None)
-        material = material._replace(surface=None, walls=walls, drag=drag)
+        material = _with_surfaces(_with_laws(self.scene.material, lossless), None)
+        material = material._replace(drag=jax.tree.map(lambda x: 0.0 * x, material.drag))
         return dataclasses.replace(self, scene=self.scene._replace(material=material))
 
-    def with_tangents(self, state: State, directions: ReducedScene) -> State:
-        spin, surface, along = state.internal.spin, self.scene.material.surface, directions.surface
+    def initial_internal(self, velocity: Float[Array, "n d"], key: PRNGKeyArray) -> SoftState:
+        surface = self.scene.material.surface
+        spin = None
+        if surface is not None:
+            mean_square = (surface.ratio / surface.inertia).astype(velocity.dtype)
+            spin = initial_spins(key, self.shape, mean_square)
+        zeros = jnp.zeros(self.replicas, velocity.dtype)
+        return SoftState(
+            elastic=zeros,  # counted by the first segment
+            refinement=jnp.ones((), velocity.dtype),
+            num_good=jnp.zeros((), jnp.int32),
+            drift=zeros,
+            spin=spin,
+        )
+
+    def initial_tangents(self, state: SphereState, directions: ReducedScene) -> ContactTangents:
+        spin = state.internal.spin
+        changes = [LOSS, COLLISIONS]
         spin_tangent = None
         if spin is not None:
+            changes.append(ROTATION)
             # Spins of q s^2 = ratio: nan along a ratio that is 0, of which they are a square root.
-            growth = jnp.where(along.ratio == 0, 0.0, along.ratio / surface.ratio)
-            growth -= along.inertia / surface.inertia
+            along = directions.surface.ratio
+            ratio = self.scene.material.surface.ratio
+            growth = jnp.where(along == 0, 0.0, along / ratio)
             spin_tangent = 0.5 * growth[:, None, None] * spin[None]
-        tangents = ContactTangents.initial(directions, state.velocity, self.replicas, spin_tangent)
-        return state._replace(tangents=tangents)
+        rates = RateSums.zero(len(changes), self.replicas, state.velocity.dtype)
+        return ContactTangents.initial(directions, state.velocity, rates, spin_tangent)
 
-    def to_lab_frame(self, state: State, velocity: Array) -> tuple[Array, Array | None]:
-        return velocity, state.internal.spin
+    def true_velocities(self, state: SphereState) -> tuple[Array, Array | None]:
+        return state.velocity, state.internal.spin
 
-    def sample_spins(self, state: State, key: PRNGKeyArray) -> State:
-        surface = self.scene.material.surface
-        if surface is None:
-            return state
-        spin = initial_spins(key, state.velocity, self.replicas, surface.ratio / surface.inertia)
-        return state._replace(internal=state.internal._replace(spin=spin))
-
-    def observe(self, state: State) -> dict[str, Array]:
+    def observe(self, state: SphereState) -> Records:
         return soft_records(state, self.scene, self.replicas)
 
     @jax.jit
-    def prepare(self, state: State, end: ArrayLike) -> tuple[State, Array, ArrayLike]:
+    def prepare(self, state: SphereState, end: ArrayLike) -> tuple[SphereState, Array, ArrayLike]:
         side = self.scene.side
         inside = neighbours.wrap(side, state.position)
         image = state.image + jnp.round((state.position - inside) / side).astype(jnp.int32)
         return state._replace(position=inside, image=image), inside, end
 
-    def advance(
-        self, state: State, listed: Float[Array, "n d"], pairs: Pairs, end: ArrayLike
-    ) -> Progress:
-        x, material = state.position, self.scene.material
+    def run_blocks(
+        self, state: SphereState, listed: Float[Array, "n d"], pairs: Pairs, end: ArrayLike
+    ) -> Segment:
+        x = state.position
+        material = self.scene.material
         xi, _, touching = overlap(x, pairs.i, pairs.j, pairs.offset)
         touching &= jnp.arange(len(xi)) < pairs.count
         stored = elastic_energy(jnp.where(touching, xi, 0.0), material.law, PAIR)
@@ -185,40 +212,38 @@ class SoftDynamics(AbstractDynamics):
             depth = wall_overlap(self.scene.container, x)[0]
             stored = jnp.sum(elastic_energy(depth, material.walls.law, WALL), axis=-1)
             elastic += jnp.sum(stored.reshape(self.replicas, -1), axis=1)
-        internal = SoftProgress(jnp.zeros(len(x), bool), jnp.ones((), x.dtype))
         state = state._replace(internal=state.internal._replace(elastic=elastic))
-        first = initial_progress(state, pairs, self.capacity, internal)
-        block = partial(self._advance_block, listed=listed, pairs=pairs, end=end)
+        retry = SoftRetry(jnp.zeros(len(x), bool), jnp.ones((), x.dtype))
+        first = Segment(state, jnp.zeros((), bool), retry)
+        block = partial(self._run_block, listed=listed, pairs=pairs, end=end)
         return repeat_until(end, block, first)
 
-    def _advance_block(
-        self, now: Progress, listed: Array, pairs: Pairs, end: ArrayLike
-    ) -> Progress:
+    def _run_block(self, now: Segment, listed: Array, pairs: Pairs, end: ArrayLike) -> Segment:
         """Run one block, and accept it if all its contacts were expected and no check failed."""
-        old, internal = now.state, now.internal
+        old = now.state
+        retry = now.retry
         duration, num_left, hottest = self._block_duration(old, end)
         # The fastest sphere of all replicas, which share their blocks.
         speed = jnp.max(fastest(old.velocity, self.replicas))
         # At rest the first reach is 0, and the next one is given by the energy in contacts.
-        from_contacts = (internal.reach_factor - 1) * jnp.sqrt(hottest)
-        reach = REACH_MARGIN * speed * internal.reach_factor + from_contacts
-        reach = reach * duration
-        candidates = self._select_candidates(old, pairs, duration, 2 * reach, internal.extra)
-        new, lost, exchanged, unexpected, max_square_move = self._integrate_block(
-            old, candidates, duration
-        )
-        new = advance_time(new, duration, end, num_left <= 1)
+        from_contacts = (retry.reach_factor - 1) * jnp.sqrt(hottest)
+        reach = (REACH_MARGIN * speed * retry.reach_factor + from_contacts) * duration
+        candidates = self._select_candidates(old, pairs, duration, 2 * reach, retry.extra)
+        block = self._integrate_block(old, candidates, duration)
+        new = advance_time(block.state, duration, end, num_left <= 1)
 
         # A sphere outside the candidates was hit, or one went farther than the reach.
-        too_far = max_square_move > reach**2
-        repeat = too_far | jnp.any(unexpected)
+        too_far = block.max_square_move > reach**2
+        repeat = too_far | jnp.any(block.unexpected)
         displacement = jnp.sqrt(jnp.max(jnp.sum((new.position - listed) ** 2, -1)))
-        before, after = (self._energy(state) for state in (old, new))
+        before = self._energy(old)
+        after = self._energy(new)
         total = jnp.where(before > 0, before, 1.0)
-        error = (after - before + lost) / total
-        allowed = WORK_TOLERANCE * exchanged / total + ENERGY_TOLERANCE
+        error = (after - before + block.lost) / total
+        allowed = WORK_TOLERANCE * block.exchanged / total + ENERGY_TOLERANCE
         settings = new.internal
-        num_good, drift = settings.num_good + 1, settings.drift + error
+        num_good = settings.num_good + 1
+        drift = settings.drift + error
         # The step is doubled again after enough good blocks.
         recovers = (num_good >= RECOVERY_BLOCKS) & (settings.refinement > 1)
         settings = settings._replace(
@@ -235,20 +260,25 @@ class SoftDynamics(AbstractDynamics):
         fault = jnp.where(invalid > 0, invalid, fault)
         new = new._replace(internal=settings)
         accepted = (fault == status.OK) & ~repeat
-        enlarged = jnp.where(too_far, 2 * internal.reach_factor, internal.reach_factor)
-        return Progress(
-            state=jax.tree.map(partial(jnp.where, accepted), new, old),
+        enlarged = jnp.where(too_far, 2 * retry.reach_factor, retry.reach_factor)
+        state = jax.tree.map(partial(jnp.where, accepted), new, old)
+        needed = jnp.maximum(old.needed, candidates.needed)
+        return Segment(
+            state=state._replace(status=fault, needed=needed),
             stale=accepted & (displacement + 2 * speed * duration > 0.5 * old.skin),
-            status=fault,
-            needed=jnp.maximum(now.needed, candidates.needed),
-            internal=SoftProgress(
-                extra=jnp.where(accepted, False, internal.extra | unexpected),
+            retry=SoftRetry(
+                extra=jnp.where(accepted, False, retry.extra | block.unexpected),
                 reach_factor=jnp.where(accepted, 1.0, enlarged),
             ),
         )
 
     def _select_candidates(
-        self, state: State, pairs: Pairs, duration: Array, margin: Array, extra: Bool[Array, "n"]
+        self,
+        state: SphereState,
+        pairs: Pairs,
+        duration: Array,
+        margin: Array,
+        extra: Bool[Array, "n"],
     ) -> ContactCandidates:
         """Select the pairs that would touch in free flight, and the pairs near those.
 
@@ -261,19 +291,25 @@ class SoftDynamics(AbstractDynamics):
             margin: largest change of a pair's distance during the block.
             extra: further particles that are known to touch another one.
         """
-        position, velocity, container = state.position, state.velocity, self.scene.container
-        n, max_near = len(position), self.capacity.near
+        position = state.position
+        velocity = state.velocity
+        container = self.scene.container
+        n = len(position)
+        max_near = self.capacity.near
         displacement = position[pairs.i] - position[pairs.j] - pairs.offset
         near = jnp.sum(displacement * displacement, -1) < (1 + margin) ** 2
         near &= jnp.arange(near.size) < pairs.count
         rows, num_near = rows_where(near, max_near)
         real = jnp.arange(max_near) < num_near
-        i, j, offset = pairs.i[rows], pairs.j[rows], pairs.offset[rows]
+        i = pairs.i[rows]
+        j = pairs.j[rows]
+        offset = pairs.offset[rows]
         displacement = displacement[rows]
 
         # Which of them come closer than a diameter in free flight.
         relative = velocity[i] - velocity[j]
-        approach, speed2 = jnp.sum(displacement * relative, -1), jnp.sum(relative * relative, -1)
+        approach = jnp.sum(displacement * relative, -1)
+        speed2 = jnp.sum(relative * relative, -1)
         closest = jnp.clip(-approach / jnp.where(speed2 > 0, speed2, 1.0), 0.0, duration)
         distance2 = jnp.sum(displacement * displacement, -1)
         touching = real & (distance2 + (2 * approach + speed2 * closest) * closest < 1.0)
@@ -285,7 +321,8 @@ class SoftDynamics(AbstractDynamics):
         # The particles that would touch, those near them, and all pairs near these.
         alone = jnp.zeros(n, bool)
         if container is not None:
-            before, after = position, position + velocity * duration
+            before = position
+            after = position + velocity * duration
             alone = extra | wall_overlap(container, before)[2] | wall_overlap(container, after)[2]
         active = mark_ends(extra | alone, touching)
         active = mark_ends(active, real & (active[i] | active[j]))
@@ -293,7 +330,9 @@ class SoftDynamics(AbstractDynamics):
         rows, real, members, (a, b), counts = select_members(
             selected, i, j, alone, self.capacity[3:]
         )
-        i, j, offset = i[rows], j[rows], offset[rows]
+        i = i[rows]
+        j = j[rows]
+        offset = offset[rows]
         return ContactCandidates(
             members=members,
             a=a,
@@ -305,10 +344,11 @@ class SoftDynamics(AbstractDynamics):
             needed=jnp.stack([pairs.count, pairs.lookahead, num_near, *counts]),
         )
 
-    def _block_duration(self, state: State, end: ArrayLike) -> tuple[Array, Array, Array]:
+    def _block_duration(self, state: SphereState, end: ArrayLike) -> tuple[Array, Array, Array]:
         """Return the duration of the next block, the number of blocks of this length until the end,
         and the temperature of the hottest replica, with the energy in its contacts."""
-        scene, velocity = self.scene, centred(state.velocity, self.replicas)
+        scene = self.scene
+        velocity = centred(state.velocity, self.replicas)
         if not scene.galilean_invariant:  # walls and drag do not move with the centre of mass
             velocity = state.velocity.reshape(velocity.shape)
         # Without the energy in contacts a step would lengthen while all energy is stored there.
@@ -317,7 +357,8 @@ class SoftDynamics(AbstractDynamics):
         if state.internal.spin is not None:
             hottest_spins = rotational_temperature(scene, state.internal.spin, self.replicas)
             hottest = jnp.maximum(hottest, jnp.max(hottest_spins))
-        shortest_contact, material = scene.contact_duration, scene.material
+        shortest_contact = scene.contact_duration
+        material = scene.material
         if material.walls is not None:  # durations go as alpha^(-2/5) v^(-1/5)
             on_wall = shortest_contact * (material.law.alpha / material.walls.law.alpha) ** 0.4
             shortest_contact = jnp.minimum(shortest_contact, on_wall)
@@ -329,22 +370,19 @@ class SoftDynamics(AbstractDynamics):
         return time_until_end / num_left, num_left, hottest
 
     def _integrate_block(
-        self, state: State, candidates: ContactCandidates, duration: Array
-    ) -> tuple[State, Array, Array, Bool[Array, "n"], Array]:
-        """Return the state after a block, at its old time, and what decides whether it is accepted.
-
-        That is, by replica, the energy lost in contacts and to drag, and the work of the elastic
-        forces, with all its parts counted as positive; the particles that touched another one or a
-        wall although not all of their neighbours belong to the candidates; and the square of the
-        largest distance that a member moved.
-        """
-        scene, replicas, members = self.scene, self.replicas, candidates.members
+        self, state: SphereState, candidates: ContactCandidates, duration: Array
+    ) -> IntegratedBlock:
+        """Integrate the candidates, and let all others fly."""
+        scene = self.scene
+        replicas = self.replicas
+        members = candidates.members
         n = len(state.position)
         replica_of_particle = jnp.arange(n) // (n // replicas)
         replica_of_member = jnp.minimum(members // (n // replicas), replicas - 1)
 
         def move(spheres: Spheres, material: ReducedScene):
             """Return all spheres after free flight, the members after the block, and energies."""
+            material = _with_surfaces(material, scene.material)
             walls = material.walls
             if walls is not None:
                 walls = walls._replace(law=_of_rows(walls.law, replica_of_member))
@@ -376,7 +414,8 @@ class SoftDynamics(AbstractDynamics):
         if tangents is None or len(tangents.clock) == 0:
             ends, (work, lost_to_drag) = move(spheres, scene.material)
         else:
-            material, material_tangents = _material_by_replica(scene.material, tangents)
+            material = _with_surfaces(scene.material)
+            material, material_tangents = _material_by_replica(material, tangents)
             ends, end_tangents, (work, lost_to_drag) = jax.vmap(
                 lambda *tangent: jax.jvp(move, (spheres, material), tangent, has_aux=True),
                 out_axes=(None, 0, None),
@@ -392,9 +431,12 @@ class SoftDynamics(AbstractDynamics):
         def sum_pairs(values: Array) -> Shaped[Array, "replicas"]:
             return jnp.zeros(replicas, values.dtype).at[candidates.replica].add(values)
 
-        lost, exchanged, stored = map(sum_pairs, (pairs.dissipated, pairs.exchanged, pairs.stored))
+        lost = sum_pairs(pairs.dissipated)
+        exchanged = sum_pairs(pairs.exchanged)
+        stored = sum_pairs(pairs.stored)
         partners = members[jnp.stack([candidates.a, candidates.b], 1)]
-        nowhere, surprise = jnp.zeros(n, bool), pairs.touched & ~candidates.expected
+        nowhere = jnp.zeros(n, bool)
+        surprise = pairs.touched & ~candidates.expected
         touching = mark(nowhere, pairs.touching[:, None], partners)
         unexpected = mark(nowhere, surprise[:, None], partners)
         if walls is not None:
@@ -419,9 +461,15 @@ class SoftDynamics(AbstractDynamics):
         if tangents is not None:
             new = new._replace(tangents=tangents._replace(free=~touching))
             new = new._replace(tangents=self._project_if_due(state, new, lost, begun, duration))
-        return new, lost_with_drag, exchanged, unexpected, jnp.max(jnp.sum(moved**2, -1))
+        return IntegratedBlock(
+            state=new,
+            lost=lost_with_drag,
+            exchanged=exchanged,
+            unexpected=unexpected,
+            max_square_move=jnp.max(jnp.sum(moved**2, -1)),
+        )
 
-    def _energy(self, state: State) -> Float[Array, "replicas"]:
+    def _energy(self, state: SphereState) -> Float[Array, "replicas"]:
         energy = kinetic_energy(state.velocity, self.replicas)
         if state.internal.spin is not None:
             inertia = self.scene.material.surface.inertia
@@ -429,60 +477,62 @@ class SoftDynamics(AbstractDynamics):
         return energy + state.internal.elastic
 
     def _project_if_due(
-        self, old: State, new: State, lost: Array, begun: Array, duration: Array
+        self, old: SphereState, new: SphereState, lost: Array, begun: Array, duration: Array
     ) -> ContactTangents:
         """Return the tangents after a block, projected if a projection is due.
 
         `lost` and `begun` are the energy lost in contacts, and the number of those that began.
         """
-        scene, replicas, tangents = self.scene, self.replicas, new.tangents
+        scene = self.scene
+        replicas = self.replicas
+        tangents = new.tangents
         velocity = peculiar_velocity(scene, new.velocity, replicas)
-        T, velocity = observables.temperature(velocity), velocity.reshape(new.velocity.shape)
+        T = observables.temperature(velocity)
+        velocity = velocity.reshape(new.velocity.shape)
         energy = kinetic_energy(velocity, replicas)
-        spin, gain_ratio = new.internal.spin, tangents.rotational_gain
-        if spin is not None and gain_ratio is not None:
+        passed = duration * jnp.sqrt(T)
+        stored = new.internal.elastic
+        trend = cooling_trend(scene, T)
+        collisions = 2 * replicas / len(new.position) * begun
+        amounts = [lost, collisions]
+        trends = [(energy + stored) * trend * duration, passed]
+        spin = new.internal.spin
+        if spin is not None:
             # In contacts rotation gained its change less that by drag.
-            first, last = (kinetic_energy(s, replicas) for s in (old.internal.spin, spin))
+            first = kinetic_energy(old.internal.spin, replicas)
+            last = kinetic_energy(spin, replicas)
             gain = last - first
             if (drag := scene.drag_rates) is not None:
                 gain += drag.rotational_rate * duration * (first + last)
             gain = scene.material.surface.inertia * gain
-            lost += gain
-            passed = duration * jnp.sqrt(T) * scene.collision_frequency
-            ratio = ratio_or_zero(rotational_temperature(scene, spin, replicas), T)
-            gain_ratio = gain_ratio.after(passed, gain, energy * passed, ratio)
-        collisions, trend = 2 * replicas / len(new.position) * begun, cooling_trend(scene, T)
-        stored, frequency = new.internal.elastic, scene.collision_frequency
-        tangents = tangents._replace(
-            rates=tangents.rates.after(
-                lost, collisions, energy + stored, T, trend, duration, frequency
-            ),
-            elapsed=tangents.elapsed + duration,
-            thermal_elapsed=tangents.thermal_elapsed + duration * jnp.sqrt(T),
-            rotational_gain=gain_ratio,
+            amounts = [lost + gain, collisions, gain]
+            trends.append(energy * passed)
+        rates = tangents.rates.after(
+            jnp.stack(amounts), jnp.stack(trends), passed * scene.collision_frequency
         )
-        passed = tangents.elapsed * jnp.sqrt(jnp.mean(T))
-        due = passed * scene.collision_frequency >= self.projection
-        cooling = cooling_rate(scene, tangents, T)
-        projected = tangents.projected(velocity, cooling, spin)
+        tangents = tangents._replace(rates=rates, elapsed=tangents.elapsed + duration)
+        since = tangents.elapsed * jnp.sqrt(jnp.mean(T))
+        due = since * scene.collision_frequency >= self.projection
+        projected = tangents.projected(velocity, spin)
         return jax.tree.map(lambda new, old: jnp.where(due, new, old), projected, tangents)
 
-    def recover(self, now: Progress, before: State) -> tuple[State, Int[Array, ""]]:
+    def recover(self, now: Segment, before: SphereState) -> SphereState:
         """Halve a step that was too large, and lengthen a skin that was exceeded."""
-        state, longest = now.state, max_skin(self.scene.side)
+        state = now.state
+        longest = max_skin(self.scene.side)
         fresh = state.time == before.time  # otherwise a new neighbour list is enough
-        exceeded = status.has(now.status, status.SKIN_EXCEEDED) & fresh
-        shorten = status.has(now.status, status.STEP_TOO_LARGE)
+        exceeded = status.has(state.status, status.SKIN_EXCEEDED) & fresh
+        shorten = status.has(state.status, status.STEP_TOO_LARGE)
         shorten |= exceeded & (state.skin >= longest)
         unrecoverable = shorten & (state.internal.refinement >= MAX_REFINEMENT)
         halve = shorten & ~unrecoverable
         finer = jnp.where(halve, 2 * state.internal.refinement, state.internal.refinement)
         num_good = jnp.where(halve, 0, state.internal.num_good)
-        skin = jnp.where(exceeded, jnp.minimum(1.5 * state.skin, longest), state.skin)
-        recovered = state._replace(
-            skin=skin, internal=state.internal._replace(refinement=finer, num_good=num_good)
+        return state._replace(
+            skin=jnp.where(exceeded, jnp.minimum(1.5 * state.skin, longest), state.skin),
+            internal=state.internal._replace(refinement=finer, num_good=num_good),
+            status=jnp.where(unrecoverable, state.status, state.status & FATAL),
         )
-        return recovered, jnp.where(unrecoverable, now.status, now.status & FATAL)
 
 
 def _of_rows(numbers: Any, replica: Int[Array, "rows"]) -> Any:
@@ -507,31 +557,35 @@ def _faster(material: ReducedScene, factor: ArrayLike) -> ReducedScene:
     return _with_laws(material, faster)._replace(drag=drag)
 
 
+def _with_surfaces(material: ReducedScene, source: ReducedScene | None = None) -> ReducedScene:
+    """Return a material with the surfaces of spheres and walls of another one, or without any.
+
+    Derivatives in the numbers of surfaces are refused, so that they have no tangents.
+    """
+    walls = material.walls
+    if walls is not None:
+        walls = walls._replace(surface=source and source.walls.surface)
+    return material._replace(surface=source and source.surface, walls=walls)
+
+
 def _material_by_replica(
     material: ReducedScene, tangents: ContactTangents
 ) -> tuple[ReducedScene, ReducedScene]:
-    """Return the material and its tangents, by replica for all that a change of clock changes.
+    """Return a material without surfaces and its tangents, by replica.
 
     Velocities that are (1 + c/2) times as large in the same material are those of a slower clock
     in the material for spheres that are (1 - c/2) times as fast.
     """
-    c, one = tangents.log_temperature, jnp.ones_like(tangents.elapsed)
+    c = tangents.log_temperature
+    one = jnp.ones_like(tangents.elapsed)
     by_clock = jax.jvp(partial(_faster, material), (one,), (-0.5 * one,))[1]
-
-    def with_surfaces_of(numbers: ReducedScene, source: ReducedScene | None) -> ReducedScene:
-        walls, surface = numbers.walls, source and source.surface
-        if walls is not None:
-            walls = walls._replace(surface=source and source.walls.surface)
-        return numbers._replace(surface=surface, walls=walls)
-
-    def by_replica(change: Callable[..., Array], *numbers: ReducedScene) -> ReducedScene:
-        without_surfaces = [with_surfaces_of(each, None) for each in numbers]
-        return with_surfaces_of(jax.tree.map(change, *without_surfaces), numbers[0])
-
-    rows = by_replica(lambda x: jnp.broadcast_to(x, c.shape[1:]), material)
-    return rows, by_replica(
-        lambda direction, change: direction[:, None] + c * change, tangents.directions, by_clock
+    rows = jax.tree.map(lambda x: jnp.broadcast_to(x, c.shape[1:]), material)
+    slopes = jax.tree.map(
+        lambda direction, change: direction[:, None] + c * change,
+        _with_surfaces(tangents.directions),
+        by_clock,
     )
+    return rows, slopes
 
 
 def cooling_trend(
@@ -550,7 +604,7 @@ def cooling_rate(
     scene: SphereScene, tangents: ContactTangents, temperature: Float[Array, "replicas"]
 ) -> Float[Array, "replicas"]:
     """Return ``-d ln T/dt`` at a temperature, by contacts and drag."""
-    by_contacts = tangents.rates.cooling(cooling_trend(scene, temperature))
+    by_contacts = tangents.rates.rate(LOSS, cooling_trend(scene, temperature))
     drag = scene.drag_rates
     return by_contacts if drag is None else by_contacts + 2 * drag.rate
 
@@ -564,39 +618,46 @@ def rotational_temperature(
 
 
 @partial(jax.jit, static_argnames="replicas")
-def soft_records(state: State, scene: SphereScene, replicas: int) -> dict[str, Array]:
-    """Return the records of a state; with tangents, also those that `rule.with_tangents` adds.
+def soft_records(state: SphereState, scene: SphereScene, replicas: int) -> Records:
+    """Return the records of a state.
 
-    The derivative of T is that of the run up to the projection; those of the other records are
-    estimated from it. The elastic energy goes as ``T^(7/5) alpha^(-2/5)``.
+    The derivative of T is that of the run up to the projection; the derivatives of the other
+    records are estimated from it. The elastic energy goes as ``T^(7/5) alpha^(-2/5)``.
     """
-    values, travelled, velocity = common_records(state, scene, replicas)
-    values["elastic_energy"] = state.internal.elastic / velocity.shape[1]
+    values, velocity = common_values(state, scene, replicas)
+    num_particles, d = velocity.shape[1:]
+    values["elastic_energy"] = state.internal.elastic / num_particles
     spin = state.internal.spin
     if spin is not None:  # it is None during equilibration
         values["rotational_temperature"] = rotational_temperature(scene, spin, replicas)
     if state.tangents is None:
-        return values
-    tangents, T, U = state.tangents, values["temperature"], values["elastic_energy"]
+        return Records(values, {}, {})
+    tangents = state.tangents
+    T = values["temperature"]
+    U = values["elastic_energy"]
     cooling = cooling_rate(scene, tangents, T)
-    projected = tangents.projected(velocity.reshape(state.velocity.shape), cooling)
+    projected = tangents.projected(velocity.reshape(state.velocity.shape))
     c = projected.log_temperature
-    along, rates = derivatives_of_records(values, travelled, velocity, projected, cooling)
     stiffer = (tangents.directions.law.alpha / scene.material.law.alpha)[:, None]
-    along["elastic_energy"] = (1.4 * c - 0.4 * stiffer) * U[None]
-    rates["elastic_energy"] = -1.4 * cooling * U
-    if spin is None:
-        return rule.with_tangents(values, along, rates, projected.clock)
-    name, inertia = "rotational_temperature", scene.material.surface.inertia
-    T_rot = values[name]
-    logs = (tangents.directions.surface.inertia / inertia)[:, None] + tangents.log_temperature
-    logs += 2 * component_along(tangents.spin, spin, replicas)
-    gain = tangents.rotational_gain.at(ratio_or_zero(T_rot, T))
-    rate = velocity.shape[-1] / spin.shape[1] * gain * scene.collision_frequency * T**1.5
-    if (drag := scene.drag_rates) is not None:
-        rate -= 2 * drag.rotational_rate * T_rot
-    along[name], rates[name] = logs * T_rot[None], rate
-    # The tangents of paths are known only for smooth spheres.
-    paths = {"displacement", "velocity_correlation"}
-    known = {name: x for name, x in values.items() if name not in paths}
-    return values | rule.with_tangents(known, along, rates, projected.clock)
+    rates = {
+        "temperature": -cooling * T,
+        "collisions": tangents.rates.rate(COLLISIONS, jnp.sqrt(T)),
+        "elastic_energy": -1.4 * cooling * U,
+    }
+    at_place = {
+        "temperature": c * T[None],
+        "collisions": jnp.zeros_like(c),
+        "elastic_energy": (1.4 * c - 0.4 * stiffer) * U[None],
+    }
+    if spin is not None:
+        T_rot = values["rotational_temperature"]
+        logs = tangents.log_temperature + 2 * component_along(tangents.spin, spin, replicas)
+        energy = 0.5 * d * num_particles * T
+        gain = tangents.rates.rate(ROTATION, energy * jnp.sqrt(T))
+        rate = 2 / (num_particles * spin.shape[1]) * gain
+        if (drag := scene.drag_rates) is not None:
+            rate -= 2 * drag.rotational_rate * T_rot
+        at_place["rotational_temperature"] = logs * T_rot[None]
+        rates["rotational_temperature"] = rate
+    slopes = {name: x - rates[name][None] * projected.clock for name, x in at_place.items()}
+    return Records(values, with_dissipated_energy(rates, d), with_dissipated_energy(slopes, d))

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxgran.particles.state import surface_direction, torque
+from jaxgran.particles.elements import surface_direction, torque
 from jaxgran.scene.contact import contact_force, midpoint_rate
 from jaxgran.scene.gas import ReducedContact, ReducedFriction, ReducedScene, SphereScene
 
@@ -128,13 +128,15 @@ def wall_overlap(
 ) -> tuple[Float[Array, "n d"], Float[Array, "n d"], Bool[Array, "n"]]:
     """Return overlaps with the nearer wall across each axis (negative without contact), 1 or -1 for
     the direction to this wall, and which spheres touch one."""
-    below, above = 0.5 - x, x - (container - 0.5)[None]
+    below = 0.5 - x
+    above = x - (container - 0.5)[None]
     xi = jnp.maximum(below, above)
     outwards = jnp.where(above > below, 1.0, -1.0).astype(x.dtype)
     return xi, outwards, jnp.any(xi > 0, axis=-1)
 
 
-PAIR, WALL = 0.5, 1.0
+PAIR = 0.5
+WALL = 1.0
 """Effective mass of two spheres, and of a sphere and a wall."""
 
 
@@ -175,7 +177,8 @@ def normal_force(
         mass: effective mass.
         dt: time step.
     """
-    rho, A = mass * law.alpha, law.dissipative_constant
+    rho = mass * law.alpha
+    A = law.dissipative_constant
     rate = midpoint_rate(xi, xi_dot, law.alpha, A, dt)
     force = contact_force(xi, rate, rho, A, clipped=law.clipped)
     elastic = contact_force(xi, 0.0, rho, 0.0)
@@ -207,7 +210,8 @@ def tangential_kick(
         response: change of the slip over the kick.
         dt: time step.
     """
-    viscous, limit = surface.damping * normal.viscous, surface.friction * normal.force
+    viscous = surface.damping * normal.viscous
+    limit = surface.friction * normal.force
     mean = slip / (1 + 0.5 * dt * viscous * response)[:, None]
     square = jnp.sum(mean * mean, -1)
     slips = square > 0
@@ -268,9 +272,14 @@ def integrate(
     Returns:
         The members at the end, and energies and contacts of the block.
     """
-    a, b, offset = candidates.a, candidates.b, candidates.offset
-    dt, container, dtype = jnp.asarray(duration / num_steps), scene.container, members.x.dtype
-    surface, walls_material = material.surface, material.walls
+    a = candidates.a
+    b = candidates.b
+    offset = candidates.offset
+    dt = jnp.asarray(duration / num_steps)
+    container = scene.container
+    dtype = members.x.dtype
+    surface = material.surface
+    walls_material = material.walls
     wall_law = walls_material and jax.tree.map(_column, walls_material.law)
 
     def rub_walls(v: Array, spin: Array, depth: Array, outwards: Array, push: NormalForce):
@@ -284,7 +293,8 @@ def integrate(
             across = jax.tree.map(lambda x, axis=axis: x[:, axis], push)
             response = 1 + lever**2 / surface.inertia
             kick, taken = tangential_kick(slip, across, walls_material.surface, response, dt)
-            v, lost = v + kick, lost + taken
+            v = v + kick
+            lost = lost + taken
             spin = spin + (lever / surface.inertia)[:, None] * torque(towards, kick)
         return v, spin, lost
 
@@ -335,9 +345,11 @@ def integrate(
         spheres, lost = fly(scene, Spheres(x, v, spin), dt, material)
         return spheres, (pairs, walls, jax.tree.map(jnp.add, lost_to_drag, lost))
 
-    touching_at_start, zeros = overlap(members.x, a, b, offset)[2], jnp.zeros(len(a), dtype)
+    touching_at_start = overlap(members.x, a, b, offset)[2]
+    zeros = jnp.zeros(len(a), dtype)
     num_begun = jnp.zeros(len(a), jnp.int32)
-    pairs, walls = ContactWork(zeros, zeros, num_begun, touching_at_start), None
+    pairs = ContactWork(zeros, zeros, num_begun, touching_at_start)
+    walls = None
     if container is not None:
         zeros = jnp.zeros(len(members.x), dtype)
         walls = ContactWork(zeros, zeros, touched=wall_overlap(container, members.x)[2])

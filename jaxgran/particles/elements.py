@@ -1,0 +1,217 @@
+"""Drag, the kicks of a drive, and rough impacts: elements of a scene that all particles share.
+
+Spins are ``s = (sigma/2) w`` with the angular velocity w: the surface of a sphere moves at the
+speed s.
+
+Instantaneous impacts with drag are computed in transformed time. Between collisions
+``dv/dt = -gamma v``, and so ``v = u exp(-gamma t)`` with a velocity u that only collisions change.
+In the time ``s = (1 - exp(-gamma t))/gamma`` positions obey ``dx = u ds``: the sequence of
+collisions is that of a gas without drag. The laws of collision take the true velocities,
+``v = u (1 - gamma s)``, and the true spins, which decay at another rate. A run stores u, and spins
+without their decay.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from jaxgran.gradients.tangents import ExchangeTangents
+from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
+from jaxgran.scene.gas import ReducedDrag, ReducedRough
+
+
+class DragDecay(NamedTuple):
+    """Decay by drag until one time.
+
+    Attributes:
+        velocity: true over stored velocities, v over u: ``exp(-gamma t)``.
+        spin: true over stored spins, divided by `velocity`: spins in the unit of u.
+        true_spin: true over stored spins.
+    """
+
+    velocity: Float[Array, "..."]
+    spin: Float[Array, "..."]
+    true_spin: Float[Array, "..."]
+
+
+def drag_decay(drag: ReducedDrag | None, time: Float[Array, "..."]) -> DragDecay:
+    """Return the decay until a transformed time, ``s = (1 - exp(-gamma t))/gamma``; 1 without drag.
+
+    Args:
+        drag: rates of drag in the unit of the time; None without drag.
+        time: s.
+    """
+    if drag is None:
+        one = jnp.ones_like(time)
+        return DragDecay(one, one, one)
+    velocity = 1 - drag.rate * time
+    rotational_rate = 0.0 if drag.rotational_rate is None else drag.rotational_rate
+    spin = jnp.exp(-rotational_rate * true_duration(drag, 0.0, time))
+    return DragDecay(velocity, spin / velocity, spin)
+
+
+def true_duration(
+    drag: ReducedDrag, start: Float[Array, "..."] | float, duration: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """Return the true duration, >= 0, of a transformed one that begins at a transformed time."""
+    safe = jnp.where(drag.rate > 0, drag.rate, 1.0)
+    share = drag.rate * duration / (1 - drag.rate * start)
+    return jnp.maximum(jnp.where(drag.rate > 0, -jnp.log1p(-share) / safe, duration), 0.0)
+
+
+def transformed_times(drag: ReducedDrag, times: Float[Array, "times"]) -> Float[Array, "times"]:
+    """Return the transformed times of true times."""
+    safe = jnp.where(drag.rate > 0, drag.rate, 1.0)
+    return jnp.where(drag.rate > 0, -jnp.expm1(-drag.rate * times) / safe, times)
+
+
+def exchange_slopes(
+    values: dict[str, Array],
+    tangents: ExchangeTangents,
+    drag: ReducedDrag | None,
+    drag_directions: Any,
+    time: Float[Array, ""],
+    size: tuple[int, int],
+) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Return derivatives of T, T_rot and collisions.
+
+    Args:
+        values: the records, some of which are these.
+        tangents: of the energies that the particles exchange.
+        drag: rates of drag; None without drag.
+        drag_directions: directions in these rates, like `drag`.
+        time: transformed time of the records.
+        size: N and d.
+
+    Returns:
+        The derivatives in time, and along the directions, as in `jaxgran.gradients.rule.Records`.
+    """
+    n, d = size
+    decay = jnp.zeros(2)
+    decay_slopes = jnp.zeros((1, 2))
+    if drag is not None:
+
+        def logarithms(drag: ReducedDrag) -> Array:
+            left = drag_decay(drag, time)
+            return jnp.log(jnp.stack([left.velocity, left.true_spin]))
+
+        decay, linear = jax.linearize(logarithms, drag)
+        decay_slopes = jax.vmap(linear)(drag_directions)
+    slopes = {"collisions": 2 / n * tangents.collisions}
+    components = {"temperature": d, "rotational_temperature": NUM_SPIN_COMPONENTS[d]}
+    for k, (name, count) in enumerate(components.items()):
+        if name in values:
+            energy = n * count / 2
+            moved = jnp.exp(2 * decay[k]) * tangents.energies[:, k] / energy
+            slopes[name] = moved + 2 * decay_slopes[:, k, None] * values[name][None]
+    elapsed = jnp.where(time > 0, time, 1.0)  # the last direction is the direction of time
+    rates = {name: x[-1] / elapsed for name, x in slopes.items()}
+    return rates, {name: x[:-1] for name, x in slopes.items()}
+
+
+MAX_KICK = 0.05
+"""Largest relative growth of T by the kicks of one step."""
+
+
+def kick_variance(
+    strength: Array, drag: ReducedDrag | None, start: Array, duration: Array, place: float
+) -> Array:
+    """Return the growth of T by half of the kicks of a step, at its begin (place 0) or end (1).
+
+    With drag a kick decays as a velocity does, and the start and the duration are transformed.
+    """
+    if drag is None:
+        return strength * jnp.maximum(duration, 0.0) / 2
+    time = true_duration(drag, start, duration)
+    return strength * time / 2 / drag_decay(drag, start + place * duration).velocity ** 2
+
+
+def random_kicks(
+    key: PRNGKeyArray,
+    velocity: Float[Array, "N d"],
+    zero_momentum: bool,
+    kicked: Bool[Array, "N"] | None = None,
+) -> Float[Array, "N d"]:
+    """Draw kicks with components of mean 0 and variance 1, in the shape of velocities.
+
+    Each component is the number of ones in 16 random bits, centred and scaled. Its fourth moment is
+    4 % below that of a Gaussian number. Sums over the many small kicks of a mean free time are
+    Gaussian.
+
+    Args:
+        key: key of the random numbers.
+        velocity: velocities of the particles of one replica.
+        zero_momentum: whether the sum of the kicks is 0. Kicks are then enlarged by
+            ``sqrt(N/(N - 1))``, so that their mean square is 1 again.
+        kicked: mask of the particles that are kicked; None for all. The values of the others are
+            arbitrary.
+    """
+    bits = jax.random.bits(key, velocity.shape, jnp.uint16)
+    kicks = 0.5 * (jax.lax.population_count(bits).astype(velocity.dtype) - 8)
+    if not zero_momentum:
+        return kicks
+    if kicked is None:
+        n = len(velocity)
+        return (n / (n - 1)) ** 0.5 * (kicks - jnp.mean(kicks, axis=0, keepdims=True))
+    n = jnp.maximum(jnp.sum(kicked), 2).astype(velocity.dtype)
+    mean = jnp.sum(jnp.where(kicked[:, None], kicks, 0.0), axis=0, keepdims=True) / n
+    return jnp.sqrt(n / (n - 1)) * (kicks - mean)
+
+
+def threefry_key(words: Array) -> PRNGKeyArray:
+    """Return a threefry key from two 32-bit words; its numbers are the same under `jax.vmap`."""
+    return jax.random.wrap_key_data(words, impl="threefry2x32")
+
+
+def surface_direction(
+    spin: Float[Array, "pairs spins"], normal: Float[Array, "pairs d"]
+) -> Float[Array, "pairs d"]:
+    """Return ``s x n``, the velocity of the surface at the point in direction n."""
+    if normal.shape[-1] == 2:
+        return spin * jnp.stack([-normal[:, 1], normal[:, 0]], axis=-1)
+    return jnp.cross(spin, normal)
+
+
+def torque(
+    normal: Float[Array, "pairs d"], force: Float[Array, "pairs d"]
+) -> Float[Array, "pairs spins"]:
+    """Return ``n x f``, which has one component in two dimensions."""
+    if normal.shape[-1] == 2:
+        return (normal[:, 0] * force[:, 1] - normal[:, 1] * force[:, 0])[:, None]
+    return jnp.cross(normal, force)
+
+
+def tangential_impulse(
+    relative: Float[Array, "pairs d"],
+    spin: Float[Array, "pairs spins"],
+    normal: Float[Array, "pairs d"],
+    where: Bool[Array, "pairs"],
+    eta: Float[Array, ""],
+    surface: ReducedRough,
+    normal_kick: Float[Array, "pairs"],
+) -> tuple[Float[Array, "pairs d"], Float[Array, "pairs d"], Float[Array, "pairs spins"]]:
+    """Return the tangential part of impacts, ``-eta`` times the slip: see `jaxgran.Rough`.
+
+    Args:
+        relative: velocity of the first partner minus that of the second.
+        spin: sum of the spins of both partners; a wall has none.
+        normal: unit vector from the first to the second.
+        where: mask of the impacts with friction.
+        eta: share of the slip that becomes the kick of spheres that stick.
+        surface: of the spheres.
+        normal_kick: size of the normal part of the velocity change of the first partner.
+
+    Returns:
+        The tangential part of the relative velocity of the centres, the velocity change of the
+        first partner, and the spin change, the same for both partners.
+    """
+    sideways = relative - jnp.sum(relative * normal, axis=-1, keepdims=True) * normal
+    slip = jnp.where(where[:, None], sideways + surface_direction(spin, normal), 0.0)
+    kick = -eta * slip
+    if surface.friction is not None:
+        square = jnp.sum(kick**2, axis=-1)
+        length = jnp.sqrt(jnp.where(square > 0, square, 1.0))
+        kick = kick * jnp.minimum(surface.friction * normal_kick / length, 1.0)[:, None]
+    return sideways, kick, torque(normal, kick) / surface.inertia
