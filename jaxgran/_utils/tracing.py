@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, DTypeLike
+from jaxtyping import Array, Bool, DTypeLike
 
 
 def any_traced(*trees: Any) -> bool:
@@ -115,3 +115,11 @@ def fast_compilation(backend: str) -> dict[str, Any]:
         return {}
     emitters = {} if jax.__version_info__ >= (0, 11) else {"xla_cpu_use_fusion_emitters": False}
     return {"xla_backend_optimization_level": 1} | emitters
+
+
+def nan_where(failed: Bool[Array, "..."], x: Array) -> Array:
+    """Return a record with nan where a run failed, also in derivatives, but no nan in integers."""
+    if not jnp.issubdtype(x.dtype, jnp.inexact):
+        return x
+    failed = failed.reshape(*failed.shape, *[1] * (x.ndim - failed.ndim))
+    return x * jnp.where(failed, jnp.nan, 1.0).astype(x.dtype)

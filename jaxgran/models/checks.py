@@ -11,10 +11,9 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
 from jaxgran._utils import status
-from jaxgran._utils.tracing import any_traced, is_known, known_part
+from jaxgran._utils.tracing import any_traced, is_known, known_part, nan_where
 from jaxgran.data.curve import CoolingCurve, Run
 from jaxgran.models.base import AbstractModel, Limitation
-from jaxgran.particles.snapshot import nan_where
 from jaxgran.scene.elements import VOLUME_TOLERANCE, container_volume_ratio
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import MIN_BOX, NODES, PACKING_LIMIT

@@ -13,7 +13,7 @@ from equinox import AbstractClassVar, AbstractVar
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran._utils import status
-from jaxgran._utils.tracing import any_traced
+from jaxgran._utils.tracing import any_traced, nan_where
 from jaxgran.data.curve import DEFAULTS, QUANTITIES, CoolingCurve, Particles, Run
 from jaxgran.gradients.rule import Result
 from jaxgran.models import checks
@@ -181,7 +181,7 @@ class AbstractParticleModel(AbstractModel):
         curve = CoolingCurve.of_replicas(times, values, status=result.status | fault, **others)
         if saved is None:
             return curve
-        saved = jax.tree.map(partial(snapshot.nan_where, invalid[:, None]), saved)
+        saved = jax.tree.map(partial(nan_where, invalid[:, None]), saved)
         if not saves_particles:
             return curve.with_saved(jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), saved))
         box_side = jnp.broadcast_to(units.box_side, (len(times), *units.box_side.shape))

@@ -41,7 +41,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from tqdm import tqdm
 
 from jaxgran._utils import status
-from jaxgran._utils.tracing import fast_compilation, near_map_limit
+from jaxgran._utils.tracing import fast_compilation, nan_where, near_map_limit
 from jaxgran.data import checkpoint
 from jaxgran.data.curve import Run
 from jaxgran.data.particles import Sphere, Trajectory
@@ -96,7 +96,7 @@ class Recorder(eqx.Module):
             arrays = dynamics.to_lab_frame(state)
             particles = snapshot.particles(self.units, dynamics.shape[0], *arrays)
             saved = snapshot.saved(self.save, particles)
-            saved = jax.tree.map(partial(snapshot.nan_where, failed), saved)
+            saved = jax.tree.map(partial(nan_where, failed), saved)
         # Replicas are the last axis of all others.
         one_or_nan = jnp.where(failed, jnp.nan, 1.0)  # a factor: derivatives are nan, too
         records = jax.tree.map(lambda x: x * one_or_nan.astype(x.dtype), dynamics.observe(state))

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxgran.data.curve import Particles
 from jaxgran.scene.gas import Gas
@@ -93,11 +93,3 @@ def _as_array(leaf: Any) -> Array:
     if jnp.issubdtype(array.dtype, jax.dtypes.extended):
         raise ValueError(f"save must return numbers, got an array of {array.dtype} from it")
     return array
-
-
-def nan_where(failed: Bool[Array, "..."], x: Array) -> Array:
-    """Return a record with nan where a run failed, also in derivatives, but no nan in integers."""
-    if not jnp.issubdtype(x.dtype, jnp.inexact):
-        return x
-    failed = failed.reshape(*failed.shape, *[1] * (x.ndim - failed.ndim))
-    return x * jnp.where(failed, jnp.nan, 1.0).astype(x.dtype)
