@@ -39,7 +39,11 @@ TEMPERATURE_COLUMNS: dict[str, tuple[int, Callable[..., np.ndarray], str]] = {
     "v2_xy": (1, lambda x, d, m: x / 2, "<v_x^2 + v_y^2>/2, for isotropic velocities"),
     "energy": (1, lambda E, d, m: 2 * E / (d * m), "2 E/(d m), E in J per particle"),
 }
-"""Columns from which T = <v^2>/d is computed: their power in T, T of values, d and m, words."""
+"""Columns from which T = <v^2>/d is computed: their power in T, T of values, d and m, words. Where
+sizes differ m is the mean mass, and T of an energy is ``<m v^2>/(d m)``."""
+
+FROM_ENERGY = f"T = {TEMPERATURE_COLUMNS['energy'][2]}"
+"""Entry T_from of the header where T was computed from a column energy."""
 
 ANY_MATERIAL = {"density": "1", "Y": "1", "nu": "0", "T0": "1"}
 """Header keys that the collision frequency over sqrt(T0) does not depend on."""
@@ -191,7 +195,8 @@ def _with_temperature(
                     "header, or give T = <v^2>/d itself"
                 )
             size, density = (files.header_number(header, key) for key in ("diameter", "density"))
-            mass = float(sphere_mass(size, density))
+            spread = files.header_number({"diameter_sd": "0"} | header, "diameter_sd") / size
+            mass = float(sphere_mass(size, density)) * (1 + 3 * spread**2)
         power, temperature, words = TEMPERATURE_COLUMNS[name]
         columns["T"] = temperature(values, d, mass)
         header["T_from"] = f"T = {words}"
