@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.scene.gas import PAIRS, ReducedSizes
 from jaxgran.theory.averages import collision_rate, loss_nodes
@@ -58,18 +58,20 @@ def partial_temperatures(ratio: Float[Array, "..."]) -> Float[Array, "2 ..."]:
     return jnp.stack([1 + half, 1 - half])
 
 
-def energy_ratio(spread: Float[Array, "..."], ratio: Float[Array, "..."]) -> Float[Array, "..."]:
+def energy_ratio(spread: ArrayLike, ratio: ArrayLike) -> Float[Array, "..."]:
     """Return the temperature by the energy, ``<m v^2>/(d <m>)``, over ``T = <v^2>/d``.
 
     Args:
         spread: s.
-        ratio: q.
+        ratio: q, any shape.
     """
+    spread, ratio = jnp.asarray(spread), jnp.asarray(ratio)
     return 1 - spread * (3 + spread**2) / (1 + 3 * spread**2) * jnp.tanh(ratio / 2)
 
 
-def energy_slope(spread: Float[Array, "..."], ratio: Float[Array, "..."]) -> Float[Array, "..."]:
+def energy_slope(spread: ArrayLike, ratio: ArrayLike) -> Float[Array, "..."]:
     """Return the derivative of the logarithm of `energy_ratio` in q."""
+    spread, ratio = jnp.asarray(spread), jnp.asarray(ratio)
     change = spread * (3 + spread**2) / (1 + 3 * spread**2) / (2 * jnp.cosh(ratio / 2) ** 2)
     return -change / energy_ratio(spread, ratio)
 
