@@ -302,7 +302,7 @@ class KineticTheory(AbstractModel):
         """
         rate = error_model.correlated if self.correlations else error_model.homogeneous
         contacts = error_model.corrected_contacts if self.softness else error_model.instant_contacts
-        elements = error_model.mixing + error_model.roughness
+        elements = error_model.mixing + error_model.roughness + error_model.sizes
         return rate + contacts + error_model.truncation(self.order) + elements
 
     def limitations(self, gas: Gas, num_particles: int | None = None) -> tuple[Limitation, ...]:
