@@ -61,6 +61,7 @@ QUANTITIES = {
         *(part for measured in WITH_ERRORS for part in (measured, measured.error)),
         Quantity("sonine", "a2", "1", "second Sonine coefficient"),
         Quantity("third_sonine", "a3", "1", "third Sonine coefficient"),
+        Quantity("size_ratio", "size_ratio", "1", "<v^2> of small over that of large spheres"),
         Quantity("collisions", "collisions", "1", "collisions per particle since t = 0"),
         Quantity("diffusion", "D", "m^2/s", "self-diffusion coefficient"),
         Quantity("velocity_correlation", "velocity_correlation", "m^2/s^2", "<v(0) . v(t)>/d"),
@@ -124,6 +125,8 @@ class CoolingCurve(eqx.Module):
         displacement: mean square displacement <dr^2> since t = 0, m^2.
         sonine: a_2, second Sonine coefficient of the velocity distribution.
         third_sonine: a_3, third Sonine coefficient.
+        size_ratio: mean square velocity of the smaller half of spheres of unequal sizes over that
+            of the larger half: see `jaxgran.theory.sizes`.
         collisions: collisions per particle since t = 0.
         diffusion: self-diffusion coefficient D(t), m^2/s.
         temperature_error: standard error of T, m^2/s^2, of a measured or stochastic curve.
@@ -160,6 +163,7 @@ class CoolingCurve(eqx.Module):
     displacement: Float[Array, "... times"] | None = _optional("m^2")
     sonine: Float[Array, "... times"] | None = _optional("")
     third_sonine: Float[Array, "... times"] | None = _optional("")
+    size_ratio: Float[Array, "... times"] | None = _optional("")
     collisions: Float[Array, "... times"] | None = _optional("")
     diffusion: Float[Array, "... times"] | None = _optional("m^2/s")
     temperature_error: Float[Array, "... times"] | None = _optional("m^2/s^2")

@@ -71,12 +71,19 @@ ANY_GAS = {"eta": "0.1", "T0": "1"}
 EXACT_DENSITY_ERROR = 1e-4
 """Relative error of the prior of a density without an error, where the diameter has one."""
 
-_MIXTURE = "grains of a mixture have a temperature for each kind, and one T is too few"
+_MIXTURE = (
+    "grains of a mixture have a temperature for each kind, and one T is too few; sizes within a "
+    "fifth of their mean have the key diameter_sd"
+)
 _STICKING = "grains that stick lose all of their speed below some speed, and grow"
 
 UNSUPPORTED_KEYS = {
     "gravity": (0.0, "under gravity density and T change with height, but gases are homogeneous"),
-    "polydispersity": (0.0, "grains of unequal masses have unequal temperatures"),
+    "polydispersity": (
+        0.0,
+        "grains of unequal masses have unequal temperatures, and sizes have the key diameter_sd, "
+        "the standard deviation of the diameters in m",
+    ),
     "diameter_2": (None, _MIXTURE),
     "density_2": (None, _MIXTURE),
     "aspect_ratio": (1.0, "rods and ellipsoids collide at another rate and rotate"),
@@ -91,9 +98,10 @@ def gas_of_header(header: dict[str, str]) -> tuple[Gas, list[str]]:
     """Return the gas that the header of a file describes, and questions about unusual values.
 
     Args:
-        header: in SI: eta (the packing fraction), diameter (m), density (of the material, kg/m^3),
-            Y (Pa), nu, T0 (m^2/s^2) and, if it is not 3, dimension; A (s), 0 by default; for rough
-            spheres, walls, drag and a drive also the keys of `elements_of_header`.
+        header: in SI: eta (the packing fraction), diameter (m; the mean one), density (of the
+            material, kg/m^3), Y (Pa), nu, T0 (m^2/s^2) and, if it is not 3, dimension; A (s), 0 by
+            default; where sizes differ diameter_sd, the standard deviation of diameters (m); for
+            rough spheres, walls, drag and a drive also the keys of `elements_of_header`.
 
     Returns:
         A gas of viscoelastic spheres, and a question for each value that is not usual in a granular
@@ -159,6 +167,8 @@ def make_gas(header: dict[str, str]) -> Gas:
     if "eta" not in header and {"N", "container_side", "diameter"} <= header.keys():
         size = files.header_number(header, "diameter")
         sphere = pi / 6 * size**3 if d == 3 else pi / 4 * size**2
+        spread = files.header_number({"diameter_sd": "0"} | header, "diameter_sd") / size
+        sphere *= 1 + (2 * d - 3) * spread**2
         volume = np.prod(np.broadcast_to(header_sides(header), d))
         header = header | {"eta": repr(float(files.header_number(header, "N") * sphere / volume))}
     missing = [key for key in REQUIRED if key not in header]
@@ -175,6 +185,7 @@ def make_gas(header: dict[str, str]) -> Gas:
         packing_fraction=values["eta"],
         temperature=values["T0"],
         dimension=d,
+        diameter_sd=files.header_number(header, "diameter_sd") if "diameter_sd" in header else None,
         **elements_of_header(header),
     )
     if gas.container is not None and "N" in header:

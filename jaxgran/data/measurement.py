@@ -20,7 +20,7 @@ from jaxgran._utils.validation import (
 )
 from jaxgran.data import files
 from jaxgran.data.curve import QUANTITIES, CoolingCurve
-from jaxgran.data.curve_file import CSV_FILE, read_data
+from jaxgran.data.curve_file import CSV_FILE, FROM_ENERGY, read_data
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.header import (
     ABSENT,
@@ -84,6 +84,8 @@ class Measurement(eqx.Module):
         errors_measured: True if the errors of the data are those of the measurement. Errors of T of
             one run that equal ``sqrt(2/(d N)) T`` are otherwise taken for the fluctuation of
             independent samples and left out, since the fluctuations of N grains are known.
+        of_energy: True if T is that by the mean energy over the mean mass, ``<m v^2>/(d <m>)``, and
+            not ``<v^2>/d``: of spheres of unequal sizes they differ.
         rounding: last digit of a field of the curve as it was written, SI, one number or one for
             each time, as ``{"temperature": 1e-6}``; {} if all are exact.
         guesses: parameters of the gas whose values are guesses, which a fit must estimate.
@@ -107,6 +109,7 @@ class Measurement(eqx.Module):
     ensemble_start: bool = eqx.field(static=True, default=False)
     calibration_error: float = eqx.field(static=True, default=0.0)
     errors_measured: bool = eqx.field(static=True, default=False)
+    of_energy: bool = eqx.field(static=True, default=False)
     rounding: dict[str, Float[Array, "..."]] = eqx.field(default_factory=dict)
     guesses: tuple[str, ...] = eqx.field(static=True, default=())
     header: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
@@ -124,6 +127,7 @@ class Measurement(eqx.Module):
         ensemble_start: bool = False,
         calibration_error: float = 0.0,
         errors_measured: bool = False,
+        of_energy: bool = False,
         rounding: dict[str, Any] | None = None,
         guesses: tuple[str, ...] = (),
         header: tuple[tuple[str, str], ...] = (),
@@ -151,7 +155,10 @@ class Measurement(eqx.Module):
         self.tracked = None if tracked is None else checked_int("tracked", tracked, 1)
         if tracked is not None and num_particles is not None and tracked > num_particles:
             raise ValueError(f"tracked must be at most N = {num_particles}, got {tracked}")
-        check_bool(ensemble_start=ensemble_start, errors_measured=errors_measured)
+        check_bool(
+            ensemble_start=ensemble_start, errors_measured=errors_measured, of_energy=of_energy
+        )
+        self.of_energy = of_energy
         self.ensemble_start = ensemble_start
         self.calibration_error = checked_float(
             "calibration_error", calibration_error, NON_NEGATIVE, "0.02 stands for 2 %."
@@ -259,6 +266,7 @@ def read_measurement(
             ensemble_start=header_choice(entries, "T0_of", ("run", "ensemble")) == "ensemble",
             calibration_error=files.header_number({"T_scale_err": "0"} | entries, "T_scale_err"),
             errors_measured=header_choice(entries, "errors", ("any", "measured")) == "measured",
+            of_energy=entries.get("T_from") == FROM_ENERGY,
             rounding=content.rounding,
             guesses=guesses_of_header(entries),
             header=tuple(entries.items()),

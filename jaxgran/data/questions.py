@@ -114,9 +114,11 @@ def scene_of(header: dict[str, str]) -> Scene:
     """Return what the factors of definitions of T depend on."""
     known = {"diameter", "density"} <= header.keys()
     size, density = (files.header_number(header, k) if known else np.nan for k in _SIZE)
+    spread = files.header_number({"diameter_sd": "0"} | header, "diameter_sd") / size
+    mean_cube = 1 + 3 * spread**2  # of diameters, over the cube of their mean
     return Scene(
         d=files.header_count(header, "dimension") or 3,
-        mass=float(sphere_mass(size, density)) if known else np.nan,
+        mass=float(sphere_mass(size, density)) * mean_cube if known else np.nan,
         number=files.header_count(header, "N") or np.nan,
         T0=files.header_number({"T0": "0"} | header, "T0") or np.nan,
     )

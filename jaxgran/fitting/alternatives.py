@@ -450,7 +450,14 @@ def _kinds(problem: Problem, flat: np.ndarray, absent: tuple[str, ...]) -> list[
         known.add(WHITE)
     known |= {DECLARABLE[name][0] for name in absent}
     known |= {name for gas in scenes.values() for name in gas.domains}
-    return [kind for kind in possible if known.isdisjoint(kind.parameters)]
+    supported = {FLOOR, WHITE, START_TIME}.union(*(m.gas.domains for m in problem.curves))
+    for m in problem.curves:  # spheres of unequal sizes have neither walls nor roughness
+        supported &= {FLOOR, WHITE, START_TIME, *m.gas.domains}
+    return [
+        kind
+        for kind in possible
+        if known.isdisjoint(kind.parameters) and supported.issuperset(kind.parameters)
+    ]
 
 
 def _initial_rate(m: CurveRows, values: dict[str, Any], curve: dict[str, Any]) -> float:

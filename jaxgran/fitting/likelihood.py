@@ -42,6 +42,7 @@ from jaxgran.theory.covariance import (
     transposed,
 )
 from jaxgran.theory.equations import Spins
+from jaxgran.theory.sizes import energy_ratio, energy_slope
 
 RATE_ERROR_LENGTH = 1.0
 """Change of ln T over which the error of theory's cooling rate is correlated."""
@@ -84,6 +85,9 @@ class Nodes(NamedTuple):
         rotation: T_rot/T; 0 for smooth spheres.
         sonine: a_2, shape (nodes,).
         collisions: per particle.
+        size_ratio: q of spheres of unequal sizes (`jaxgran.theory.sizes`); None of equal ones.
+        by_size_ratio: derivative of the logarithm of the measured T in q: 0 unless it is the
+            temperature by the energy; None for equal spheres.
     """
 
     times: Any
@@ -91,6 +95,8 @@ class Nodes(NamedTuple):
     rotation: Any
     sonine: Any
     collisions: Any
+    size_ratio: Any = None
+    by_size_ratio: Any = None
 
 
 def log_ratio(values: Array, log_computed: Array, errors: Array) -> Array:
@@ -187,7 +193,8 @@ def filtered(
     """
     with jax.numpy_rank_promotion("allow"):  # the gases are the last axis of all arrays
         steps = _steps(gas, nodes, noise, differentiable)
-        return _run_filter(steps, residuals, variances, sensitivity, used, noise)
+        by_size = nodes.by_size_ratio
+        return _run_filter(steps, residuals, variances, sensitivity, used, noise, by_size)
 
 
 def _run_filter(
@@ -197,6 +204,7 @@ def _run_filter(
     sensitivity: Float[Array, "nodes gases"],
     used: Float[Array, "nodes 2"],
     noise: Noise,
+    by_size_ratio: Float[Array, "nodes gases"] | None = None,
 ) -> tuple[Float[Array, "nodes 2 columns gases"], Float[Array, "nodes 2 gases"]]:
     start, changes, increments, of_rotation = steps
     dtype = residuals.dtype
@@ -229,12 +237,14 @@ def _run_filter(
 
     def step(state, at):
         mean, covariance = state
-        change, increment, share, by_rotation, value, variance, is_used = at
+        change, increment, share, by_rotation, value, variance, is_used, by_size = at
         mean = mean + jnp.sum(change[:, :, None] * mean[None], axis=1)
         moved = covariance + product(change, covariance)
         covariance = moved + product(moved, transposed(change)) + increment
         # T is that of the gas, with the sampling error; ln T_rot is ln T + ln(T_rot/T).
         of_T = share * unit[0] + unit[sample]
+        if by_size is not None:  # that of their energy depends on the ratio of temperatures, too
+            of_T = of_T + share * by_size * unit[1]
         of_rotation = unit[0] + by_rotation * unit[1]
         state = mean, covariance
         state, of_first, variance_of_first = update(state, of_T, value[0], variance[0], is_used[0])
@@ -244,7 +254,7 @@ def _run_filter(
         found = jnp.stack([of_first, of_second])
         return state, (found, jnp.stack([variance_of_first, variance_of_second]))
 
-    at = changes, increments, sensitivity, of_rotation, residuals, variances, used
+    at = changes, increments, sensitivity, of_rotation, residuals, variances, used, by_size_ratio
     return jax.lax.scan(step, (mean, first), at)[1]
 
 
@@ -267,6 +277,7 @@ def _steps(
         jnp.broadcast_to(nodes.sonine[:, None], nodes.rotation.shape),
         nodes.collisions,
         Spins(nodes.rotation, None, None),
+        nodes.size_ratio,
     )
     rates = jax.vmap(run_process, in_axes=(0, -1), out_axes=-1)
     jacobian, spread, starts = rates(gas, jax.tree.map(_middle, means))
@@ -284,6 +295,8 @@ def _steps(
     if gas.surface is not None:
         of_ratio = _change(jnp.log(nodes.rotation + ROTATION_OFFSET))
         drift = drift.at[1, rate_error].set(error * of_ratio)
+    if nodes.size_ratio is not None:
+        drift = drift.at[1, rate_error].set(error * _change(nodes.size_ratio))
     memory = jnp.abs(of_T) / RATE_ERROR_LENGTH
     drift = drift.at[rate_error, rate_error].set(-memory)
     noises = noises.at[rate_error, rate_error].set(2 * memory)
@@ -370,6 +383,14 @@ def log_likelihood(
     collisions = collisions if computed.collisions is None else computed.collisions
     observed = jax.tree.map(jnp.asarray, rows.at_nodes(times.size, place))
     logs = jnp.stack([log_T, log_T + jnp.log(jnp.where(ratio > 0, ratio, 1.0))], axis=1)
+    size_ratio = by_size_ratio = None
+    if computed.size_ratio is not None:
+        size_ratio = jnp.log(computed.size_ratio)
+        spread = gas.diameter_sd / gas.diameter
+        by_size_ratio = nothing
+        if measurement.of_energy:
+            logs = logs.at[:, 0].add(jnp.log(energy_ratio(spread, size_ratio)))
+            by_size_ratio = energy_slope(spread, size_ratio)
     residuals = log_ratio(observed.values, logs, observed.errors)
     variances = (observed.errors / jnp.exp(logs)) ** 2
     density_change = log_density_change(observed.values, logs, observed.errors)
@@ -392,6 +413,8 @@ def log_likelihood(
         for_each(ratio),
         nothing if computed.sonine is None else computed.sonine,
         for_each(collisions),
+        None if size_ratio is None else for_each(size_ratio),
+        None if by_size_ratio is None else for_each(by_size_ratio),
     )
     values, spread = filtered(
         jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *jnp.shape(x))), gas),

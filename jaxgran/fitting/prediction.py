@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxgran._utils.tracing import fast_compilation
 from jaxgran.data.measurement import START_TIME
@@ -34,6 +35,7 @@ from jaxgran.fitting.rows import (
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.linearise import linearise
 from jaxgran.scene.gas import Gas
+from jaxgran.theory.sizes import energy_ratio, energy_slope
 
 FLOOR = "floor"
 """Noise floor, m^2/s^2, added to the computed T: a parameter of an alternative explanation."""
@@ -104,6 +106,7 @@ class Prediction(NamedTuple):
         compared: ln T and ln T_rot that are compared with the data, shape (nodes, 2).
         displacement: ln <dr^2>, shape (nodes,).
         floats: of the gas, by name.
+        size_ratio: q of spheres of unequal sizes, shape (nodes,); None of equal ones.
         scatter: logarithm of the scatter.
     """
 
@@ -113,6 +116,7 @@ class Prediction(NamedTuple):
     compared: np.ndarray
     displacement: np.ndarray
     floats: dict[str, np.ndarray]
+    size_ratio: np.ndarray | None = None
     scatter: float = 0.0
 
 
@@ -205,10 +209,18 @@ class PredictedCurve:
         T = np.exp(batch.compared[:, 0])
         compared = batch.compared.copy()
         compared[:, 0] = np.log(T + floor)
-        nodes = Nodes(self.times, batch.log_T, batch.rotation, self.sonine, batch.collisions)
         gases = len(around)
         gas = jax.tree.map(lambda x: np.broadcast_to(x, (gases, *np.shape(x))), self.gas)
         gas = with_floats(gas, {name: np.moveaxis(x, -1, 0) for name, x in batch.floats.items()})
+        nodes = Nodes(
+            self.times,
+            batch.log_T,
+            batch.rotation,
+            self.sonine,
+            batch.collisions,
+            batch.size_ratio,
+            self.by_size_ratio(gas, batch.size_ratio),
+        )
         compiled = _compiled(innovations, jax.default_backend())
         found = compiled(gas, nodes, compared, T / (T + floor), observed, noise)
         # Values of T are followed by those of T_rot.
@@ -238,12 +250,16 @@ class PredictedCurve:
         errors = observed.errors / np.exp(self.prediction.compared)
         noise = self._noise(np.asarray([self.prediction.scatter]), sources)
         variances = (errors**2 + observed.simulation)[..., None]
+        size_ratio = self.prediction.size_ratio
+        size_ratio = None if size_ratio is None else size_ratio[:, None]
         nodes = Nodes(
             self.times,
             self.prediction.log_T[:, None],
             self.prediction.rotation[:, None],
             self.sonine,
             self.prediction.collisions[:, None],
+            size_ratio,
+            self.by_size_ratio(self.gas, size_ratio),
         )
         gas = jax.tree.map(lambda x: np.asarray(x)[None], self.gas)
         one = np.ones((self.times.size, 1))
@@ -253,6 +269,14 @@ class PredictedCurve:
         values, spread = (np.asarray(x)[self.place, ..., 0] for x in found)
         values = values / np.sqrt(spread)[..., None]
         return values.swapaxes(0, 1).reshape(-1, count)
+
+    def by_size_ratio(self, gas: Gas, size_ratio: np.ndarray | None) -> np.ndarray | None:
+        """Return the derivative of ln T as measured in q; None for equal spheres."""
+        if size_ratio is None:
+            return None
+        if not self.rows.measurement.of_energy:
+            return np.zeros_like(size_ratio)
+        return np.asarray(energy_slope(spread_of(gas), size_ratio))
 
     def _observed(self, sources: dict[str, float]) -> Observed:
         factor = sources.get("measurement", 1.0) ** 0.5
@@ -323,18 +347,34 @@ def predicted_curve(
     before[place] = elapsed < 0
     power = power_of_line(gas)
 
+    size_ratio = None
+    if "size_ratio" in known:
+        size_ratio = np.log(known["size_ratio"])
+
     log_T = np.log(T)
     log_rotation = np.log(np.maximum(T_rot, TINY))
     log_displacement = np.log(np.maximum(displacement, TINY))
     common = values.get(CALIBRATION, 0.0)
     factors = np.array([common, common + values.get(ROTATION, 0.0)])
     logs = np.stack([log_T, log_rotation], axis=1)
+    of_energy = rows.measurement.of_energy and size_ratio is not None
+    if of_energy:
+        spread = spread_of(gas)
+        by_energy, slope_in_spread, slope_in_ratio = energy_slopes(spread, size_ratio)
+        logs[:, 0] += by_energy
     line = np.minimum(np.exp(-power * (logs - logs[:1])), MAX_LINE_BEFORE)
     continued = logs[:1] - np.log(2 - line) / power
     base = np.where(before[:, None], continued, logs) + factors
     base[place] += rows.offset
     prediction = Prediction(
-        log_T, T_rot / T, collisions, base, log_displacement, floats, values.get(SCATTER, 0.0)
+        log_T,
+        T_rot / T,
+        collisions,
+        base,
+        log_displacement,
+        floats,
+        size_ratio,
+        values.get(SCATTER, 0.0),
     )
 
     def compared(of_T: np.ndarray, of_rotation: np.ndarray) -> np.ndarray:
@@ -358,6 +398,14 @@ def predicted_curve(
             return slopes[name] * element.slope / np.maximum(over, TINY)
 
         of_T = change("temperature", T)
+        of_measured = of_T
+        of_size_ratio = None
+        if size_ratio is not None:
+            of_size_ratio = change("size_ratio", known["size_ratio"])
+        if of_energy:
+            of_spread = {"diameter_sd": 1 / gas.diameter, "diameter": -spread / gas.diameter}
+            change_of_spread = float(of_spread.get(element.name, 0.0)) * element.slope
+            of_measured = of_T + slope_in_ratio * of_size_ratio + slope_in_spread * change_of_spread
         of_rotation = change("rotational_temperature", T_rot)
         factors = {ROTATION: np.array([0.0, 1.0]), CALIBRATION: np.ones(2)}
         of_floats = {name: np.zeros_like(x) for name, x in floats.items()}
@@ -367,9 +415,11 @@ def predicted_curve(
             of_T,
             T_rot / T * (of_rotation - of_T),
             change("collisions", np.ones_like(T)),
-            compared(of_T, of_rotation) + element.slope * factors.get(element.name, np.zeros(2)),
+            compared(of_measured, of_rotation)
+            + element.slope * factors.get(element.name, np.zeros(2)),
             change("displacement", displacement),
             of_floats,
+            of_size_ratio,
             element.slope if element.name == SCATTER else 0.0,
         )
 
@@ -385,6 +435,26 @@ def predicted_curve(
         elements,
         {name: x[place] if np.ndim(x) else x for name, x in known.items()},
     )
+
+
+def spread_of(gas: Gas) -> np.ndarray:
+    """Return the standard deviation of diameters over their mean; of many gases shape (1, gases)."""
+    spread = np.asarray(gas.diameter_sd) / np.asarray(gas.diameter)
+    return spread[None] if spread.ndim else spread
+
+
+def energy_slopes(
+    spread: np.ndarray, size_ratio: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the logarithm of `energy_ratio`, and its derivatives in the spread and in q."""
+
+    def log_ratio(spread: Array, size_ratio: Array) -> Array:
+        return jnp.log(energy_ratio(spread, size_ratio))
+
+    value, slope = jax.jvp(
+        lambda s: log_ratio(s, size_ratio), (jnp.asarray(spread),), (jnp.ones_like(spread),)
+    )
+    return tuple(map(np.asarray, (value, slope, energy_slope(spread, size_ratio))))
 
 
 def shift_of_nodes(

@@ -77,6 +77,11 @@ class AbstractModel(eqx.Module):
         for name in gas.elements:
             if name not in self.elements:
                 field = "surface" if name == "friction" else name
+                if name == "diameter_sd":
+                    raise ValueError(
+                        f"{type(self).__name__} has equal spheres and does not support "
+                        "diameter_sd. Use KineticTheory, or set diameter_sd=None."
+                    )
                 given = type(getattr(gas, field)).__name__
                 models = " or ".join(_models_with(name))
                 instead = ", or surface=Rough(...) for impacts" if name == "friction" else ""

@@ -42,6 +42,9 @@ SONINES = validation.Domain(-0.4, 1.0)
 NUM_GRID_TIMES = 97
 """Number of times between which a covariance is propagated, in addition to the given ones."""
 
+MAX_SEARCHED_SPREAD = 0.3
+"""diameter_sd over the diameter up to which a search computes curves."""
+
 SLIDING_ACCURACY = 0.2
 """Relative accuracy of T_rot/T of spheres that slide and rotated at t = 0, or have rough walls."""
 
@@ -65,6 +68,11 @@ class KineticTheory(AbstractModel):
     T_rot/T: see `rotation_accuracy`); walls, with the denser layer before them
     (`jaxgran.scene.elements`); drag; a drive by white noise. Between walls the curve has no D and
     <dr^2>.
+
+    Spheres of unequal sizes (`Gas.diameter_sd`) are two halves of small and large spheres with a
+    temperature each (`jaxgran.theory.sizes`). They may have drag, which is that of Stokes; roughness,
+    walls and a drive are refused, and the curve has no D and <dr^2>. Against runs of 1 : 1.2 and
+    1 : 1.4 and of diameters within 10 % the rate is right to .5 %.
 
     The curve is differentiable in every float of the gas and in the times, forward and reverse.
     Second derivatives must be forward over forward or forward over reverse, as in `jax.hessian`,
@@ -167,12 +175,12 @@ class KineticTheory(AbstractModel):
     def displacement_accuracy(self, gas: Gas) -> Any:
         """Relative error of <dr^2> by the Sonine order of D and by correlated collisions.
 
-        It is None between walls.
+        It is None between walls and for spheres of unequal sizes.
 
         Hard spheres diffuse faster than in Enskog's theory by the share 0.85 phi up to phi = .2
         (Speedy, Mol. Phys. 62 (1987) 509); this is assumed for disks, too.
         """
-        if gas.container is not None:
+        if gas.container is not None or gas.diameter_sd is not None:
             return None
         correlation = 0.85 * jnp.minimum(gas.packing_fraction, 0.2)
         sonine = 0.005 if self.order > 2 and self.sonine else {2: 0.024, 3: 0.017}[gas.dimension]
@@ -185,7 +193,13 @@ class KineticTheory(AbstractModel):
         return checks.first_cooling_rate(gas)[0]
 
     def covariance(
-        self, gas: Gas, times: validation.UserNumber, num_particles: int, *, rotation: bool = False
+        self,
+        gas: Gas,
+        times: validation.UserNumber,
+        num_particles: int,
+        *,
+        rotation: bool = False,
+        energy: bool = False,
     ) -> Float[Array, "n n"]:
         """Return the covariance of ln T of one run of N spheres at some times.
 
@@ -206,6 +220,8 @@ class KineticTheory(AbstractModel):
             times: t, s, shape (times,), >= 0, increasing.
             num_particles: N, >= 1.
             rotation: give also ln T_rot of rough spheres.
+            energy: T is that by the energy, ``<m v^2>/(d <m>)``, of spheres of unequal sizes; for
+                equal ones it is the same.
 
         Returns:
             C, shape (times, times); with `rotation` of ln T at all times, then of ln T_rot, shape
@@ -228,7 +244,7 @@ class KineticTheory(AbstractModel):
                 "rotation out."
             )
         padded = pad_to(times, padded_length(times.size))
-        whole, fault = self._compiled_covariance(gas, padded, rotation)
+        whole, fault = self._compiled_covariance(gas, padded, rotation, energy)
         if not any_traced(fault) and int(fault) != status.OK:
             raise RuntimeError(status.explain(int(fault)))
         rows = np.arange(times.size)
@@ -238,7 +254,7 @@ class KineticTheory(AbstractModel):
 
     @eqx.filter_jit
     def _compiled_covariance(
-        self, gas: Gas, times: Float[Array, "times"], rotation: bool
+        self, gas: Gas, times: Float[Array, "times"], rotation: bool, energy: bool
     ) -> tuple[Float[Array, "n n"], Any]:
         # T changes little between the times of a grid in ln(1 + t/tau_c).
         frequency = gas.collision_frequency
@@ -249,7 +265,7 @@ class KineticTheory(AbstractModel):
         state, fault = self._solver(gas, grid, 1.0).moments(scene, reduced)
         curve = self._curve(gas, grid, state, fault)
         options = {"softness": self.softness, "correlations": self.correlations}
-        whole = run_covariance(gas, curve, state.spins, rotation=rotation, **options)
+        whole = run_covariance(gas, curve, state.spins, rotation=rotation, energy=energy, **options)
         rows = jnp.searchsorted(grid, times)
         if rotation:
             rows = jnp.concatenate([rows, rows + grid.size])
@@ -257,6 +273,16 @@ class KineticTheory(AbstractModel):
 
     def check(self, gas: Gas) -> None:
         """Raise ValueError if the law heats the gas, or contacts are too soft for the theory."""
+        others = [
+            name for name in ("surface", "container", "drive") if getattr(gas, name) is not None
+        ]
+        if gas.diameter_sd is not None and others:
+            raise ValueError(
+                f"KineticTheory does not support diameter_sd together with {others[0]}="
+                f"{type(getattr(gas, others[0])).__name__}: no theory of this package has both. Set "
+                f"diameter_sd=None for equal spheres, or {others[0]}=None."
+            )
+        gas.check_sizes()
         if any_traced(gas):
             return
         rate, factor, hottest = checks.initial_cooling(gas)
@@ -276,7 +302,7 @@ class KineticTheory(AbstractModel):
         """
         rate = error_model.correlated if self.correlations else error_model.homogeneous
         contacts = error_model.corrected_contacts if self.softness else error_model.instant_contacts
-        elements = error_model.mixing + error_model.roughness
+        elements = error_model.mixing + error_model.roughness + error_model.sizes
         return rate + contacts + error_model.truncation(self.order) + elements
 
     def limitations(self, gas: Gas, num_particles: int | None = None) -> tuple[Limitation, ...]:
@@ -363,10 +389,13 @@ class KineticTheory(AbstractModel):
         return scene, jnp.where(sound, times, 0.0) * gas.impact_speed / gas.path_length
 
     def _is_sound(self, gas: Gas) -> Bool[Array, ""]:
+        sound = jnp.asarray(True)
+        if gas.diameter_sd is not None:  # a search may leave the allowed range
+            sound = gas.diameter_sd < MAX_SEARCHED_SPREAD * gas.diameter
         if not self.softness:
-            return jnp.asarray(True)
+            return sound
         law, hottest = gas.reduced_law, jnp.ones_like(gas.temperature)
-        return softness_factor(law, hottest, gas.dimension) > 0
+        return sound & (softness_factor(law, hottest, gas.dimension) > 0)
 
     def _solver(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> MomentSolver:
         rtol = self.rtol or (1e-8 if times.dtype == jnp.float64 else 1e-5)
@@ -376,7 +405,8 @@ class KineticTheory(AbstractModel):
             not self.sonine,
             self.initial_sonine,
             not self.spin_cumulants,
-            self.diffusion,
+            self.diffusion and gas.diameter_sd is None,
+            gas.diameter_sd is not None,
         )
         return MomentSolver(equations, self.solver, rtol * tolerance, self.max_steps)
 
@@ -396,6 +426,8 @@ class KineticTheory(AbstractModel):
             optional["third_sonine"] = state.third_sonine * one_or_nan
         if state.rotation is not None:
             optional["rotational_temperature"] = temperature * state.rotation
+        if state.size_ratio is not None:
+            optional["size_ratio"] = jnp.exp(state.size_ratio) * one_or_nan
         if state.diffusion is not None and state.displacement is not None:
             diffusion = state.diffusion * jnp.sqrt(theta) * length * gas.impact_speed
             optional["diffusion"] = diffusion * one_or_nan

@@ -23,7 +23,7 @@ from jaxgran.scene.elements import Rough, StokesDrag, Walls
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.laws import Viscoelastic, ViscoelasticVariant
 
-LINEARISED = "temperature", "rotational_temperature", "displacement", "collisions"
+LINEARISED = "temperature", "rotational_temperature", "displacement", "collisions", "size_ratio"
 """Fields of a curve that are linearised, if the model computes them."""
 
 COMPUTED = (*LINEARISED, "sonine", "third_sonine", "diffusion", "status")
@@ -55,7 +55,8 @@ def with_neutral_elements(gas: Gas, model: AbstractModel) -> Gas:
     """Return a gas with each element that the model supports; those added have no effect.
 
     An element of an alternative explanation is then another number of the program that computed the
-    fitted curve, and not another program, which would take seconds to compile.
+    fitted curve, and not another program, which would take seconds to compile. Spheres of unequal
+    sizes get drag alone, since no theory of them has roughness and walls.
     """
     neutral = {
         "surface": Rough(-1.0, friction=STICKING),
@@ -67,6 +68,8 @@ def with_neutral_elements(gas: Gas, model: AbstractModel) -> Gas:
         for name, element in neutral.items()
         if name in model.elements and getattr(gas, name) is None
     }
+    if gas.diameter_sd is not None:
+        added = {name: element for name, element in added.items() if name == "drag"}
     gas = with_variant_law(gas)
     if isinstance(gas.surface, Rough) and gas.surface.friction is None:
         added["surface"] = dataclasses.replace(gas.surface, friction=STICKING)

@@ -1,4 +1,4 @@
-"""The scene: a homogeneous gas of equal spheres, its physical scales, and its reduced units.
+"""The scene: a homogeneous gas of spheres, its physical scales, and its reduced units.
 
 - `reduced_scene`, for kinetic theory and DSMC: speeds in `Gas.impact_speed`, lengths in
   `Gas.path_length`.
@@ -27,7 +27,13 @@ from jaxgran._utils.validation import (
 )
 from jaxgran.scene import elements, laws
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME, ELASTIC_OVERLAP
-from jaxgran.scene.geometry import CLOSE_PACKING, contact_value, impact_average, sphere_surface
+from jaxgran.scene.geometry import (
+    CLOSE_PACKING,
+    contact_value,
+    impact_average,
+    pair_contact_value,
+    sphere_surface,
+)
 from jaxgran.scene.parameters import (
     ADVICE,
     FLOAT_UNITS,
@@ -110,20 +116,38 @@ def optional_element(name: str) -> Any:
     return eqx.field(converter=check_class, default=None, kw_only=True)
 
 
+MAX_SIZE_SPREAD = 0.2
+"""Largest standard deviation of diameters over their mean: that of two sizes 1 : 1.5."""
+
+
+def _optional_number(name: str) -> Any:
+    """Return the converter of a field that is a number or None."""
+    converter = number_named(name)
+    return lambda value: None if value is None else converter(value)
+
+
 class Gas(eqx.Module):
-    """A homogeneous gas of equal spheres in its initial state.
+    """A homogeneous gas of spheres in its initial state.
 
     Every float can be traced, differentiated and batched with `jax.vmap`.
 
     Args:
         law: law of restitution, such as `jaxgran.Viscoelastic`, `jaxgran.ConstantRestitution` or
             `jaxgran.RestitutionSeries`.
-        diameter: sigma, m, > 0.
-        mass: m, kg, > 0; `jaxgran.sphere_mass` computes it from the density of the material.
+        diameter: sigma, m, > 0; the mean (by number) where diameters differ.
+        mass: m, kg, > 0, of a sphere of this diameter; `jaxgran.sphere_mass` computes it from the
+            density of the material. Where diameters differ the mean mass is larger, by ``1 + 3
+            (diameter_sd/diameter)^2``.
         packing_fraction: phi (the paper's eta), in (0, close packing): the fraction of the volume
-            (of the area if d = 2) that the spheres occupy.
+            (of the area if d = 2) that the spheres occupy, ``(pi/6) n <sigma^3>``. Where diameters
+            differ it belongs to fewer spheres than phi of equal ones; N spheres in a known volume
+            V have ``phi = N (pi/6) sigma^3 (1 + 3 (diameter_sd/diameter)^2)/V``.
         temperature: T_0 = <v^2>/d at t = 0, m^2/s^2, > 0, without the mass, as in the paper.
         dimension: d, 3, or 2 for spheres that move in a plane.
+        diameter_sd: standard deviation of the diameters, m, from 0 to .2 sigma; None (the default)
+            for equal spheres. All spheres consist of one material, the distribution of their
+            diameters is nearly symmetric, and at t = 0 small and large ones are equally fast:
+            `jaxgran.theory.sizes`.
         surface: `jaxgran.Rough`, or `jaxgran.Frictional` for contacts of finite duration; None for
             smooth spheres.
         container: `jaxgran.Walls`; None for a periodic box or an unbounded gas.
@@ -148,6 +172,9 @@ class Gas(eqx.Module):
     )
     temperature: Float[Array, ""] = eqx.field(converter=number_named("temperature"), kw_only=True)
     dimension: int = eqx.field(static=True, default=3, kw_only=True)
+    diameter_sd: Float[Array, ""] | None = eqx.field(
+        converter=_optional_number("diameter_sd"), default=None, kw_only=True
+    )
     surface: elements.Rough | elements.Frictional | None = optional_element("surface")
     container: elements.Walls | None = optional_element("container")
     drag: elements.StokesDrag | None = optional_element("drag")
@@ -164,8 +191,24 @@ class Gas(eqx.Module):
                 "name of a float of the gas: rename it"
             )
         for name in own:
-            self.domains[name].check(name, getattr(self, name), ADVICE[name])
+            if getattr(self, name) is not None:
+                self.domains[name].check(name, getattr(self, name), ADVICE[name])
+        self.check_sizes()
         elements.check_elements(self)
+
+    def check_sizes(self) -> None:
+        """Raise ValueError if diameters differ so much that the theory of them does not hold."""
+        if self.diameter_sd is None or any(
+            isinstance(x, Tracer) for x in (self.diameter_sd, self.diameter)
+        ):
+            return
+        spread = float(np.max(np.asarray(self.diameter_sd) / np.asarray(self.diameter)))
+        if spread > MAX_SIZE_SPREAD * (1 + 1e-6):
+            raise ValueError(
+                f"diameter_sd is {spread:.3g} of the diameter, at most {MAX_SIZE_SPREAD:g} is "
+                "allowed: the theory is of second order in it. Sieve the grains, or measure one "
+                "size alone"
+            )
 
     def __getattr__(self, name: str) -> Any:
         # Python calls this only for names that are not attributes, such as floats of parts.
@@ -219,6 +262,8 @@ class Gas(eqx.Module):
     @property
     def _float_fields(self) -> dict[str, FloatField]:
         gas_domains = domains_of("Gas") | {"packing_fraction": _PACKING_DOMAINS[self.dimension]}
+        if self.diameter_sd is None:
+            del gas_domains["diameter_sd"]
         law = law_fields(self.law).items()
         fields = {name: FloatField(("law", *path), domain) for name, (path, domain) in law}
         fields |= {name: FloatField((name,), domain) for name, domain in gas_domains.items()}
@@ -233,8 +278,10 @@ class Gas(eqx.Module):
 
     @property
     def elements(self) -> tuple[str, ...]:
-        """Names of the elements of this gas; "friction" stands for a `Frictional` surface."""
-        given = tuple(name for name in ELEMENTS if getattr(self, name) is not None)
+        """Names of the elements of this gas; "friction" stands for a `Frictional` surface, and
+        diameter_sd is one of them."""
+        names = (*ELEMENTS, "diameter_sd")
+        given = tuple(name for name in names if getattr(self, name) is not None)
         return ("friction", *given[1:]) if isinstance(self.surface, elements.Frictional) else given
 
     def check_single(self) -> None:
@@ -277,6 +324,9 @@ class Gas(eqx.Module):
         volume_of_sphere = (
             sphere_surface(self.dimension) / self.dimension * (self.diameter / 2) ** self.dimension
         )
+        if self.diameter_sd is not None:
+            spread = self.diameter_sd / self.diameter
+            volume_of_sphere = volume_of_sphere * (1 + (2 * self.dimension - 3) * spread**2)
         return self.packing_fraction / volume_of_sphere
 
     @property
@@ -527,6 +577,30 @@ class ReducedDrag(NamedTuple):
     rotational_rate: Any
 
 
+PAIRS = (0, 0), (0, 1), (1, 1)
+"""Kinds of pairs of small (0) and large (1) spheres."""
+
+
+class ReducedSizes(NamedTuple):
+    """Small and large spheres in equal numbers, in reduced units.
+
+    Attributes:
+        spread: s, the standard deviation of the diameters over their mean.
+        laws: the law of the impacts of each of `PAIRS`, with a first axis (3,).
+        frequency: impacts of each of `PAIRS`, over the number of particles and over the collisions
+            of a particle in a gas of equal spheres with the same relative velocities.
+    """
+
+    spread: Float[Array, ""]
+    laws: Any
+    frequency: Float[Array, "3"]
+
+    @property
+    def masses(self) -> Float[Array, "2"]:
+        """Masses of small and large spheres, over that of a sphere of the mean diameter."""
+        return jnp.stack([1 - self.spread, 1 + self.spread]) ** 3
+
+
 class ReducedScene(NamedTuple):
     """The law and the elements of a gas in reduced units; None for each missing element.
 
@@ -535,6 +609,7 @@ class ReducedScene(NamedTuple):
         surface: `ReducedRough`, or `ReducedFriction` of contacts.
         walls, drag: `ReducedWalls`, `ReducedDrag`.
         drive: of `WhiteNoise`, the growth rate of T/T_0 that it causes.
+        sizes: `ReducedSizes`.
     """
 
     law: Any
@@ -542,6 +617,7 @@ class ReducedScene(NamedTuple):
     walls: Any = None
     drag: Any = None
     drive: Any = None
+    sizes: Any = None
 
     @property
     def drag_rates(self) -> Any:
@@ -579,7 +655,30 @@ def reduced_scene(gas: Gas) -> ReducedScene:
         drag = ReducedDrag(gas.drag.rate * time, gas.drag.rotational_rate * time)
     if gas.drive is not None:
         drive = gas.drive.strength * (length / speed) / gas.temperature
-    return ReducedScene(gas.reduced_law, surface, walls, drag, drive)
+    sizes = None if gas.diameter_sd is None else _reduced_sizes(gas, gas.diameter_sd / gas.diameter)
+    return ReducedScene(gas.reduced_law, surface, walls, drag, drive, sizes)
+
+
+def _reduced_sizes(gas: Gas, spread: Float[Array, ""]) -> ReducedSizes:
+    """Return two sizes in equal numbers that have the mean and the spread of the diameters.
+
+    eps of unequal spheres is that of equal ones with the same effective radius and effective mass.
+    """
+    d = gas.dimension
+    diameters = jnp.stack([1 - spread, 1 + spread])
+    a, b = diameters[jnp.array(PAIRS).T]
+    radius, mass = 2 * a * b / (a + b), 2 * (a * b) ** 3 / (a**3 + b**3)
+
+    def law(radius: Array, mass: Array) -> laws.ReducedLaw:
+        return gas.law.reduced(
+            diameter=gas.diameter * radius, mass=gas.mass * mass, speed=gas.impact_speed
+        )
+
+    contact = pair_contact_value(gas.packing_fraction, spread, radius, d) / gas.contact_value
+    share = jnp.array([0.125, 0.25, 0.125])
+    return ReducedSizes(
+        spread, jax.vmap(law)(radius, mass), share * contact * ((a + b) / 2) ** (d - 1)
+    )
 
 
 class ReducedContact(eqx.Module):

@@ -72,6 +72,33 @@ def contact_value(packing_fraction: ArrayLike, dimension: int) -> Any:
     return (1 - 7 * phi / 16) / (1 - phi) ** 2
 
 
+def pair_contact_value(
+    packing_fraction: ArrayLike, spread: ArrayLike, pair: ArrayLike, dimension: int
+) -> Float[Array, "..."]:
+    """Pair correlation at contact of two spheres of a gas of spheres of unequal sizes.
+
+    ``1/(1 - phi) + 3 phi y/(2 (1 - phi)^2) + phi^2 y^2/(2 (1 - phi)^3)`` with ``y = (sigma_i
+    sigma_j/sigma_ij) <sigma^2>/<sigma^3>`` in three dimensions (Boublik 1970; Mansoori, Carnahan,
+    Starling & Leland 1971), and ``1/(1 - phi) + 9 phi y/(16 (1 - phi)^2)`` with ``y = (sigma_i
+    sigma_j/sigma_ij) <sigma>/<sigma^2>`` in two (Jenkins & Mancini 1987). It is `contact_value` for
+    equal spheres.
+
+    Args:
+        packing_fraction: phi.
+        spread: standard deviation of the diameters over their mean.
+        pair: ``sigma_i sigma_j/sigma_ij`` over the mean diameter, with the mean sigma_ij of the
+            two diameters, any shape.
+        dimension: d, 2 or 3.
+    """
+    phi, square = jnp.asarray(packing_fraction), jnp.asarray(spread) ** 2
+    rest = 1 - phi
+    if dimension == 3:
+        y = pair * (1 + square) / (1 + 3 * square)
+        return 1 / rest + 3 * phi * y / (2 * rest**2) + (phi * y) ** 2 / (2 * rest**3)
+    y = pair / (1 + square)
+    return 1 / rest + 9 * phi * y / (16 * rest**2)
+
+
 def contact_value_slopes(
     packing_fraction: ArrayLike, dimension: int
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:

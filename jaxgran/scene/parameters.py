@@ -43,6 +43,7 @@ _ROWS = (
     ("dissipative_constant", "A", "s", NON_NEGATIVE, MATERIAL, "Viscoelastic"),
     ("diameter", "diameter", "m", POSITIVE, SCENE, "Gas"),
     ("mass", "", "kg", POSITIVE, SCENE, "Gas"),
+    ("diameter_sd", "diameter_sd", "m", NON_NEGATIVE, SCENE, "Gas"),
     ("density", "density", "kg/m^3", POSITIVE, MATERIAL),
     ("temperature", "T0", "m^2/s^2", POSITIVE, SCENE, "Gas"),
     ("packing_fraction", "eta", "", FRACTION, SCENE, "Gas"),
@@ -89,6 +90,7 @@ ADVICE = {
     "packing_fraction": "It is the fraction of the volume (of the area if dimension = 2) that the "
     "spheres occupy; the upper end is close packing.",
     "diameter": "Give it in metres.",
+    "diameter_sd": "Give the standard deviation of the diameters in metres.",
     "mass": "Give it in kilograms; sphere_mass(diameter, density) computes it.",
     "coefficient": "1 is an elastic impact; 0 removes the normal relative velocity.",
     "tangential_restitution": "-1 is a smooth surface, 1 a perfectly rough one.",

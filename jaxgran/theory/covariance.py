@@ -25,6 +25,11 @@ oscillator that forgets within a crossing,
 
 with the noise of Poissonian impacts in W and W', and the width W that centres have. n and u are
 stationary from t = 0 on: the spheres are in flight then.
+
+Where sizes differ the second variable is q, the logarithm of the ratio of the mean square
+velocities of small and large spheres (`jaxgran.theory.sizes`). Impacts between small and large
+spheres exchange energy, which changes T and not the energy. At t = 0 the velocities of both halves
+are drawn from one Maxwellian: q has the variance 8/(d N).
 """
 
 from functools import partial
@@ -46,6 +51,14 @@ from jaxgran.theory.averages import (
     rough_energy_moments,
 )
 from jaxgran.theory.equations import Density, Spins, coulomb_limit, mean_kick
+from jaxgran.theory.sizes import (
+    PairRates,
+    drag_factors,
+    energy_slope,
+    pair_rates,
+    partial_temperatures,
+    variable_changes,
+)
 
 WALL_NOISE = 0.15
 """f, the share of the noise of wall impacts that is left over long times.
@@ -78,12 +91,14 @@ class Mean(NamedTuple):
         collisions: per particle since t = 0.
         spins: T_rot/T of rough spheres, 0 of smooth ones, and cumulants as in `Moments`, None
             where spins are taken to be Gaussian.
+        size_ratio: q of spheres of unequal sizes; None of equal ones.
     """
 
     log_temperature: Any
     sonine: Any
     collisions: Any
     spins: Spins
+    size_ratio: Any = None
 
 
 def run_covariance(
@@ -92,6 +107,7 @@ def run_covariance(
     spins: Spins | None = None,
     *,
     rotation: bool = False,
+    energy: bool = False,
     softness: bool = True,
     correlations: bool = True,
 ) -> Float[Array, "n n"]:
@@ -109,6 +125,7 @@ def run_covariance(
         spins: T_rot/T and the cumulants of the spins at these times, as in `Moments`; without them
             spins are taken to be Gaussian, and C of T_rot is some 7 % too low.
         rotation: return the covariance of ln T_rot, too.
+        energy: T is that by the energy, see `jaxgran.theory.sizes`.
         softness, correlations: as in `jaxgran.KineticTheory`.
 
     Returns:
@@ -120,12 +137,15 @@ def run_covariance(
     if curve.rotational_temperature is not None:
         ratio = curve.rotational_temperature / curve.temperature
     spins = spins or Spins(ratio, None, None)
-    mean = Mean(jnp.log(theta), curve.sonine, curve.collisions, spins)
+    size_ratio = None if curve.size_ratio is None else jnp.log(curve.size_ratio)
+    mean = Mean(jnp.log(theta), curve.sonine, curve.collisions, spins, size_ratio)
     *rates, starts = run_process(gas, mean, softness, correlations)
     passed = jnp.diff(mean.collisions)[None, None]
     growth, noise = propagators(*((x[..., 1:] + x[..., :-1]) / 2 * passed for x in rates))
     zero = jnp.zeros_like(ratio)
     outputs = [[zero + 1, *[zero] * (len(growth) - 1)]]
+    if energy and size_ratio is not None:
+        outputs[0][1] = energy_slope(gas.diameter_sd / gas.diameter, size_ratio)
     if rotation:
         turning = ratio > 0
         by_rotation = (ratio + ROTATION_OFFSET) / jnp.where(turning, ratio, jnp.inf)
@@ -252,7 +272,8 @@ def process(
 ) -> tuple[Float[Array, "k k"], Float[Array, "k k"], Float[Array, "k k"]]:
     """Return J and Q at one time, per collision of a particle, and C of a run that starts there.
 
-    The variables are ln T, y of rough spheres, n and u of a gas between walls.
+    The variables are ln T, y of rough spheres or q of spheres of unequal sizes, n and u of a gas
+    between walls.
 
     Args:
         scene: in reduced units.
@@ -261,6 +282,8 @@ def process(
         d: dimension.
         mean: at this time.
     """
+    if scene.sizes is not None:
+        return _process_of_sizes(scene, density, d, mean)
     surface, drag, drive = scene.surface, scene.drag, scene.drive
     spins, d_rot = mean.spins, NUM_SPIN_COMPONENTS[d]
     cumulants = surface is not None and spins.correlation is not None
@@ -329,6 +352,36 @@ def process(
         stationary = (1 - WALL_NOISE) * regular[size, size] / crossing * _stationary()
         start = jnp.pad(start, (0, 2)).at[size:, size:].set(stationary)
     frequency = collision_rate(mean.sonine, d) * speed
+    return jacobian / frequency, noise / frequency, start
+
+
+def _process_of_sizes(
+    scene: ReducedScene, density: Density, d: int, mean: Mean
+) -> tuple[Float[Array, "2 2"], Float[Array, "2 2"], Float[Array, "2 2"]]:
+    """Return `process` of spheres of unequal sizes, with the variables ln T and q."""
+
+    def rates(log_temperature: Array, ratio: Array) -> tuple[Array, PairRates, Array]:
+        speed = jnp.exp(log_temperature / 2)
+        pairs = pair_rates(scene.sizes, speed, ratio, mean.sonine, d)
+        loss = loss_moments(scene.law, speed, mean.sonine)[0]
+        factor = density.factor(scene.law, speed, loss / 2, mean.collisions, d)
+        rows = jnp.stack([factor, jnp.ones_like(factor)])[:, None]
+        changes = rows * variable_changes(ratio, d)
+        of_both = changes @ pairs.changes
+        if scene.drag is not None:
+            drag = 2 * scene.drag.rate * drag_factors(scene.sizes)
+            of_T = jnp.mean(drag * partial_temperatures(ratio))
+            of_both = of_both - jnp.stack([of_T, drag[0] - drag[1]])
+        return of_both, pairs, changes
+
+    T, q = mean.log_temperature, mean.size_ratio
+    steps = jnp.asarray([[STEP, -STEP, 0, 0, 0], [0, 0, STEP, -STEP, 0]], T.dtype)
+    at, pairs, changes = jax.vmap(rates)(T + steps[0], q + steps[1])
+    jacobian = jnp.stack([at[0] - at[1], at[2] - at[3]], axis=1) / (2 * STEP)
+    noise = changes[-1] @ pairs.squares[-1] @ changes[-1].T
+    # In terms of collisions of a particle: twice as many as impacts.
+    frequency = 2 * pairs.impacts[-1] * collision_rate(mean.sonine, d) / collision_rate(0.0, d)
+    start = jnp.zeros_like(noise).at[1, 1].set(8 / d)
     return jacobian / frequency, noise / frequency, start
 
 

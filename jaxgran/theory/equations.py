@@ -42,8 +42,15 @@ from jaxgran.theory.averages import (
     impact_moments,
     rough_impact_means,
 )
+from jaxgran.theory.sizes import (
+    drag_factors,
+    equal_rates,
+    pair_rates,
+    partial_temperatures,
+    variable_changes,
+)
 
-SUPPORTED = ("surface", "container", "drag", "drive")
+SUPPORTED = ("surface", "container", "drag", "drive", "diameter_sd")
 """Elements of a scene that the equations contain, see `Gas.elements`."""
 
 
@@ -64,6 +71,8 @@ class Moments(NamedTuple):
             spheres and Gaussian spins.
         spin_kurtosis: (T_rot/T)^2 times ``a_02 = d_rot/(d_rot + 2) <w^4>/<w^2>^2 - 1``. Both
             products stay finite where the spins begin at 0.
+        size_ratio: ``q = ln(T_1/T_2)`` of small and large spheres, see `jaxgran.theory.sizes`; None
+            for equal ones.
     """
 
     log_temperature: Float[Array, "..."]
@@ -76,6 +85,7 @@ class Moments(NamedTuple):
     rotation: Float[Array, "..."] | None = None
     spin_correlation: Float[Array, "..."] | None = None
     spin_kurtosis: Float[Array, "..."] | None = None
+    size_ratio: Float[Array, "..."] | None = None
 
     @property
     def spins(self) -> "Spins | None":
@@ -168,6 +178,7 @@ class Equations(NamedTuple):
         initial_sonine: a_2 at t = 0.
         gaussian_spins: if True, a_11 and a_02 stay 0.
         spreading: whether D and <dr^2> are asked for.
+        sizes: whether the spheres differ in size.
     """
 
     dimension: int
@@ -176,6 +187,7 @@ class Equations(NamedTuple):
     initial_sonine: float = 0.0
     gaussian_spins: bool = False
     spreading: bool = True
+    sizes: bool = False
 
     @property
     def names(self) -> list[str]:
@@ -183,11 +195,13 @@ class Equations(NamedTuple):
         names = list(Moments._fields[: 5 if self.spreading else 3])
         if self.order > 2:
             names += ["third_sonine"] + (["diffusion_shape"] if self.spreading else [])
+        if self.sizes:
+            names.append("size_ratio")
         return names
 
     def moments(self, values: Float[Array, "moments ..."]) -> Moments:
         """Return the moments held by the rows of an array."""
-        names = [*self.names, *Moments._fields[7:]]
+        names = [*self.names, *Moments._fields[7:10]]
         return Moments(**dict(zip(names, values, strict=False)))
 
     def initial(self, scene: SceneAndDensity, like: Array) -> Float[Array, "moments"]:
@@ -251,12 +265,20 @@ class Equations(NamedTuple):
                 growth = zip(changes.spins, spins, (1, 1, 2), strict=True)
                 rotating = [change + power * cooling * x for change, x, power in growth]
                 rotating = rotating[: 1 if self.gaussian_spins else 3]
+        colliding, exchanging = collision_rate(a2, d, a3) * speed, []
+        if gas.sizes is not None:
+            assert moments.size_ratio is not None
+            of_T, of_ratio, often = size_rates(gas, speed, moments.size_ratio, a2, d)
+            factor = density.factor(gas.law, speed, inelasticity, moments.collisions, d)
+            cooling = cooling - factor * of_T
+            colliding = colliding * often
+            exchanging = [of_ratio]
         # Of the terms that cool the gas, only impacts change the shape of the velocity
         # distribution.
         rate = [
             -cooling,
             zero if self.maxwellian else a2_rate,
-            collision_rate(a2, d, a3) * speed,
+            colliding,
         ]
         third = [] if order == 2 else [a3_rate]
         if self.spreading:
@@ -267,7 +289,7 @@ class Equations(NamedTuple):
             diffusion, *shape = [change + net_growth * q for change, q in diffusing]
             rate += [diffusion, 2 * d * speed * moments.diffusion]
             third += shape
-        return jnp.stack(rate + third + rotating)
+        return jnp.stack(rate + third + exchanging + rotating)
 
 
 def _diffusion_rates(
@@ -295,6 +317,37 @@ def _diffusion_rates(
     second = speed * (mixed / 2 - relaxation[1, 0] * b0 - relaxation[1, 1] * b1)
     coupling = impacts * (q1 - (half + 1) * q0) - shape_decay * q1
     return [(first, q0), (second + coupling, q1)]
+
+
+def size_rates(
+    scene: ReducedScene,
+    speed: Float[Array, ""],
+    ratio: Float[Array, ""],
+    sonine: Float[Array, ""],
+    d: int,
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """Return what unequal sizes add to the rates of change of a gas of equal spheres.
+
+    Args:
+        scene: in reduced units.
+        speed: sqrt(T/T_0).
+        ratio: q, see `jaxgran.theory.sizes`.
+        sonine: a_2.
+        d: dimension.
+
+    Returns:
+        d ln T/dt without that of equal spheres, dq/dt, and the number of collisions over that of
+        equal spheres.
+    """
+    pairs = pair_rates(scene.sizes, speed, ratio, sonine, d)
+    of_T, of_ratio = variable_changes(ratio, d) @ pairs.changes
+    of_T = of_T - equal_rates(scene.law, speed, sonine, d)
+    if scene.drag is not None:
+        drag = 2 * scene.drag.rate * drag_factors(scene.sizes)
+        of_T = of_T + 2 * scene.drag.rate - jnp.mean(drag * partial_temperatures(ratio))
+        of_ratio = of_ratio - drag[0] + drag[1]
+    often = pairs.impacts / (collision_rate(0.0, d) / 2 * speed)
+    return of_T, of_ratio, often
 
 
 class ElementRates(NamedTuple):
@@ -554,6 +607,14 @@ def element_bounds(scene: ReducedScene, dimension: int) -> ElementBounds:
         by_speed = by_speed + bound
     if scene.drag is not None:
         constant = 2 * scene.drag.rate
+    if scene.sizes is not None:
+        # Impacts at most twice as fast, and all energy that of the small spheres.
+        one = jnp.ones_like(scene.sizes.spread)
+        by_speed = by_speed - equal_rates(scene.law, one, 0.0, d)
+        small, large = scene.sizes.masses
+        heating, rotation = jnp.zeros(()), (large - small) / (2 * small)
+        if scene.drag is not None:
+            constant = constant * drag_factors(scene.sizes)[0]
     if scene.drive is not None:
         heating = scene.drive
     return by_speed, constant, heating, rotation

@@ -296,7 +296,10 @@ class MomentSolver(NamedTuple):
     ) -> tuple[Array, Int[Array, ""]]:
         """Return the rows at the given times, shape (times, rows, states), and a status."""
         dtype = times.dtype
-        controlling = 5 if self.equations.spreading else 3
+        equations = self.equations
+        controlling: Any = slice(5 if equations.spreading else 3)
+        if equations.sizes:
+            controlling = np.array([0, 1, 2, len(equations.names) - 1])
         known = jnp.all(jnp.isfinite(parameters)) & jnp.all(jnp.isfinite(times))
         # With nan parameters the state stays constant, so that the solver does not shorten its
         # steps.
@@ -305,7 +308,7 @@ class MomentSolver(NamedTuple):
         controller = diffrax.PIDController(
             rtol=self.rtol,
             atol=self.rtol,
-            norm=lambda rows: optx.rms_norm(rows[0][:controlling]),
+            norm=lambda rows: optx.rms_norm(rows[0][controlling]),
         )
         rows, completed = integrate_at(
             # s = ln(1 + t): a power law of time takes the same number of steps each decade.
