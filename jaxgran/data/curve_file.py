@@ -281,6 +281,7 @@ def _read_archive(path: Path) -> tuple[CoolingCurve, dict[str, str]]:
     content = io.BytesIO(files.read_bytes(path))
     try:
         _check_sizes(content)
+        content.seek(0)
         with np.load(content, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         header = json.loads(str(arrays.pop(HEADER_ENTRY)))

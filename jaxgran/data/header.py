@@ -65,7 +65,7 @@ ABSENT = {
 MEASURED = "measured"
 """Value of the header key ``errors``: T_err is the error of the measurement, whatever its size."""
 
-ANY_GAS = {"eta": "0.1", "T0": "1"}
+ANY_GAS = {"eta": "0.1", "T0": "0.01"}
 """Header keys that single impacts do not depend on."""
 
 EXACT_DENSITY_ERROR = 1e-4

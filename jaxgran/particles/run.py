@@ -99,7 +99,11 @@ class Recorder(eqx.Module):
             saved = jax.tree.map(partial(nan_where, failed), saved)
         # Replicas are the last axis of all others.
         one_or_nan = jnp.where(failed, jnp.nan, 1.0)  # a factor: derivatives are nan, too
-        records = jax.tree.map(lambda x: x * one_or_nan.astype(x.dtype), dynamics.observe(state))
+
+        def with_nan(x: Array) -> Array:
+            return x * jnp.broadcast_to(one_or_nan.astype(x.dtype), x.shape)
+
+        records = jax.tree.map(with_nan, dynamics.observe(state))
         return records._replace(saved=saved)
 
 
