@@ -72,9 +72,10 @@ class KineticTheory(AbstractModel):
     <dr^2>.
 
     Spheres of unequal sizes (`Gas.diameter_sd`) are two halves of small and large spheres with a
-    temperature each (`jaxgran.theory.sizes`). They may have drag, which is that of Stokes; roughness,
-    walls and a drive are refused, and the curve has no D and <dr^2>. Against runs of 1 : 1.2 and
-    1 : 1.4 and of diameters within 10 % the rate is right to .5 %.
+    temperature each (`jaxgran.theory.sizes`). They may have drag, which is that of Stokes;
+    roughness, walls and a drive are refused, and the curve has no D and <dr^2>. The rate of runs of
+    1 : 1.2 and 1 : 1.4 and of diameters within 10 % is right within .6 %
+    (``experiments/accuracy/size_statistics.py``).
 
     The curve is differentiable in every float of the gas and in the times, forward and reverse.
     Second derivatives must be forward over forward or forward over reverse, as in `jax.hessian`,
@@ -268,18 +269,18 @@ class KineticTheory(AbstractModel):
         state, fault = self._solver(gas, times, 1.0).moments(scene, reduced)
         curve = self._curve(gas, times, state, fault)
         options = {"softness": self.softness, "correlations": self.correlations}
-        whole = run_covariance(
-            gas, curve, state.spins, rotation=rotation, energy=energy, **options
-        )
+        whole = run_covariance(gas, curve, state.spins, rotation=rotation, energy=energy, **options)
         return whole, curve.status
 
     def check(self, gas: Gas) -> None:
         """Raise ValueError if the law heats the gas, or contacts are too soft for the theory."""
-        others = [name for name in ("surface", "container", "drive") if getattr(gas, name) is not None]
+        others = [
+            name for name in ("surface", "container", "drive") if getattr(gas, name) is not None
+        ]
         if gas.diameter_sd is not None and others:
             raise ValueError(
                 f"KineticTheory does not support diameter_sd together with {others[0]}="
-                f"{type(getattr(gas, others[0])).__name__}: no theory of this package has both. Set "
+                f"{type(getattr(gas, others[0])).__name__}: no theory has both. Set "
                 f"diameter_sd=None for equal spheres, or {others[0]}=None."
             )
         gas.check_sizes()
