@@ -391,12 +391,13 @@ class KineticTheory(AbstractModel):
 
     def _is_sound(self, gas: Gas) -> Bool[Array, ""]:
         sound = jnp.asarray(True)
-        if gas.diameter_sd is not None:  # a search may leave the allowed range
-            sound = gas.diameter_sd < MAX_SEARCHED_SPREAD * gas.diameter
-        if not self.softness:
+        if self.softness:
+            law, hottest = gas.reduced_law, jnp.ones_like(gas.temperature)
+            sound = softness_factor(law, hottest, gas.dimension) > 0
+        if gas.diameter_sd is None:
             return sound
-        law, hottest = gas.reduced_law, jnp.ones_like(gas.temperature)
-        return sound & (softness_factor(law, hottest, gas.dimension) > 0)
+        # A search may leave the allowed range.
+        return sound & (gas.size_spread < MAX_SEARCHED_SPREAD)
 
     def _solver(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> MomentSolver:
         rtol = self.rtol or (1e-8 if times.dtype == jnp.float64 else 1e-5)
