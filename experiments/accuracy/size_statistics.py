@@ -75,7 +75,7 @@ def simulated(sizes: np.ndarray, runs: int, folder: Path) -> tuple[np.ndarray, n
 def statistics_of(times: np.ndarray, each: np.ndarray) -> dict[str, np.ndarray]:
     """Return times, number of runs, and the means and covariances of both ln T."""
     logs = np.log(each)
-    covariances = [np.cov(logs[..., k].T) for k in range(2)]
+    covariances = np.stack([np.cov(logs[..., k].T) for k in range(2)])
     means = np.mean(logs, axis=0).T
     return {"times": times, "runs": np.array(len(each)), "mean": means, "covariance": covariances}
 
@@ -87,7 +87,7 @@ def compared(sizes: np.ndarray, found: dict[str, np.ndarray]) -> Iterator[dict]:
     curve = cool(gas, times * faster, THEORY)
     log_T = np.log(np.asarray(curve.temperature))
     q = jnp.log(curve.size_ratio)
-    log_E = log_T + np.log(np.asarray(energy_ratio(gas.diameter_sd / gas.diameter, q)))
+    log_E = log_T + np.log(np.asarray(energy_ratio(gas.size_spread, q)))
     for k, (name, expected) in enumerate({"T": log_T, "energy": log_E}.items()):
         theory = np.asarray(THEORY.covariance(gas, times, NUM_PARTICLES, energy=name == "energy"))
         slope = np.gradient(expected, np.log(times))

@@ -100,8 +100,8 @@ def gas_of_header(header: dict[str, str]) -> tuple[Gas, list[str]]:
     Args:
         header: in SI: eta (the packing fraction), diameter (m; the mean one), density (of the
             material, kg/m^3), Y (Pa), nu, T0 (m^2/s^2) and, if it is not 3, dimension; A (s), 0 by
-            default; where sizes differ diameter_sd, the standard deviation of diameters (m); for
-            rough spheres, walls, drag and a drive also the keys of `elements_of_header`.
+            default; where sizes differ diameter_sd, their standard deviation (m); for rough
+            spheres, walls, drag and a drive also the keys of `elements_of_header`.
 
     Returns:
         A gas of viscoelastic spheres, and a question for each value that is not usual in a granular
@@ -178,6 +178,9 @@ def make_gas(header: dict[str, str]) -> Gas:
             f"(needed: {', '.join(REQUIRED)}; in SI units, or with a unit behind the value)"
         )
     values = {key: files.header_number(header, key) for key in REQUIRED}
+    sizes: dict[str, Any] = {}
+    if "diameter_sd" in header:
+        sizes["diameter_sd"] = files.header_number(header, "diameter_sd")
     gas = Gas(
         Viscoelastic(values["Y"], values["nu"], files.header_number({"A": "0"} | header, "A")),
         diameter=values["diameter"],
@@ -185,7 +188,7 @@ def make_gas(header: dict[str, str]) -> Gas:
         packing_fraction=values["eta"],
         temperature=values["T0"],
         dimension=d,
-        diameter_sd=files.header_number(header, "diameter_sd") if "diameter_sd" in header else None,
+        **sizes,
         **elements_of_header(header),
     )
     if gas.container is not None and "N" in header:

@@ -386,7 +386,7 @@ def log_likelihood(
     size_ratio = by_size_ratio = None
     if computed.size_ratio is not None:
         size_ratio = jnp.log(computed.size_ratio)
-        spread = gas.diameter_sd / gas.diameter
+        spread = gas.size_spread
         by_size_ratio = nothing
         if measurement.of_energy:
             logs = logs.at[:, 0].add(jnp.log(energy_ratio(spread, size_ratio)))

@@ -83,7 +83,7 @@ MESSAGES = {
     "scatter": "the scatter is that of {number:.3g} +- {error:.2g} grains",
     "of each": "{label}: chi^2 is {chi2:.3g} for {number} points; its weight in {symbol} is "
     "{weight:.2f}",
-    "assumptions": "the model assumes equal{spheres}, {where}",
+    "assumptions": "the model assumes {spheres}, {where}",
     "absent": "known to be absent: {names}",
     "quick": "alternatives were not compared, as requested",
     "driven": "additional loss terms were not tested: the gas is driven",
@@ -358,6 +358,9 @@ def _assumptions(result: Fit) -> str:
     elements = {e for m in result.measurements.values() for e in m.gas.elements}
     spheres = ", rough spheres of constant beta_t" if "surface" in elements else ", smooth spheres"
     spheres = " spheres of constant friction" if "friction" in elements else spheres
+    spheres = f"equal{spheres}"
+    if "diameter_sd" in elements:
+        spheres = "smooth spheres of one material, whose sizes differ as told"
     where = [] if "container" in elements else ["far from walls"]
     where += [] if "drag" in elements else ["in vacuum"]
     where.append("at homogeneous density")

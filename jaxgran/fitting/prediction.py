@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxgran._utils.tracing import fast_compilation
 from jaxgran.data.measurement import START_TIME
@@ -357,9 +356,9 @@ def predicted_curve(
     common = values.get(CALIBRATION, 0.0)
     factors = np.array([common, common + values.get(ROTATION, 0.0)])
     logs = np.stack([log_T, log_rotation], axis=1)
-    of_energy = rows.measurement.of_energy and size_ratio is not None
-    if of_energy:
-        spread = spread_of(gas)
+    spread = spread_of(gas)
+    slope_in_spread = slope_in_ratio = nothing
+    if rows.measurement.of_energy and size_ratio is not None:
         by_energy, slope_in_spread, slope_in_ratio = energy_slopes(spread, size_ratio)
         logs[:, 0] += by_energy
     line = np.minimum(np.exp(-power * (logs - logs[:1])), MAX_LINE_BEFORE)
@@ -402,10 +401,9 @@ def predicted_curve(
         of_size_ratio = None
         if size_ratio is not None:
             of_size_ratio = change("size_ratio", known["size_ratio"])
-        if of_energy:
-            of_spread = {"diameter_sd": 1 / gas.diameter, "diameter": -spread / gas.diameter}
-            change_of_spread = float(of_spread.get(element.name, 0.0)) * element.slope
-            of_measured = of_T + slope_in_ratio * of_size_ratio + slope_in_spread * change_of_spread
+            by_name = {"diameter_sd": 1.0, "diameter": -spread}
+            of_spread = by_name.get(element.name, 0.0) * element.slope / float(gas.diameter)
+            of_measured = of_T + slope_in_ratio * of_size_ratio + slope_in_spread * of_spread
         of_rotation = change("rotational_temperature", T_rot)
         factors = {ROTATION: np.array([0.0, 1.0]), CALIBRATION: np.ones(2)}
         of_floats = {name: np.zeros_like(x) for name, x in floats.items()}
@@ -438,8 +436,8 @@ def predicted_curve(
 
 
 def spread_of(gas: Gas) -> np.ndarray:
-    """Return the standard deviation of diameters over their mean; of many gases shape (1, gases)."""
-    spread = np.asarray(gas.diameter_sd) / np.asarray(gas.diameter)
+    """Return `Gas.size_spread`; of many gases shape (1, gases)."""
+    spread = np.asarray(gas.size_spread)
     return spread[None] if spread.ndim else spread
 
 
@@ -447,14 +445,9 @@ def energy_slopes(
     spread: np.ndarray, size_ratio: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the logarithm of `energy_ratio`, and its derivatives in the spread and in q."""
-
-    def log_ratio(spread: Array, size_ratio: Array) -> Array:
-        return jnp.log(energy_ratio(spread, size_ratio))
-
-    value, slope = jax.jvp(
-        lambda s: log_ratio(s, size_ratio), (jnp.asarray(spread),), (jnp.ones_like(spread),)
-    )
-    return tuple(map(np.asarray, (value, slope, energy_slope(spread, size_ratio))))
+    ratio = np.asarray(energy_ratio(spread, size_ratio))
+    in_spread = -3 * ((1 - spread**2) / (1 + 3 * spread**2)) ** 2 * np.tanh(size_ratio / 2) / ratio
+    return np.log(ratio), in_spread, np.asarray(energy_slope(spread, size_ratio))
 
 
 def shift_of_nodes(

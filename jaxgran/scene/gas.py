@@ -319,14 +319,21 @@ class Gas(eqx.Module):
         return text_table(title, rows)
 
     @property
+    def size_spread(self) -> Float[Array, "..."]:
+        """Standard deviation of the diameters over their mean; 0 of equal spheres."""
+        if self.diameter_sd is None:
+            return jnp.zeros_like(self.diameter)
+        return jnp.asarray(self.diameter_sd / self.diameter)
+
+    @property
     def number_density(self) -> Float[Array, ""]:
         """Number density n, m^-d."""
         volume_of_sphere = (
             sphere_surface(self.dimension) / self.dimension * (self.diameter / 2) ** self.dimension
         )
         if self.diameter_sd is not None:
-            spread = self.diameter_sd / self.diameter
-            volume_of_sphere = volume_of_sphere * (1 + (2 * self.dimension - 3) * spread**2)
+            unequal = 1 + (2 * self.dimension - 3) * self.size_spread**2
+            volume_of_sphere = volume_of_sphere * unequal
         return self.packing_fraction / volume_of_sphere
 
     @property
@@ -655,7 +662,7 @@ def reduced_scene(gas: Gas) -> ReducedScene:
         drag = ReducedDrag(gas.drag.rate * time, gas.drag.rotational_rate * time)
     if gas.drive is not None:
         drive = gas.drive.strength * (length / speed) / gas.temperature
-    sizes = None if gas.diameter_sd is None else _reduced_sizes(gas, gas.diameter_sd / gas.diameter)
+    sizes = None if gas.diameter_sd is None else _reduced_sizes(gas, gas.size_spread)
     return ReducedScene(gas.reduced_law, surface, walls, drag, drive, sizes)
 
 

@@ -145,7 +145,7 @@ def run_covariance(
     zero = jnp.zeros_like(ratio)
     outputs = [[zero + 1, *[zero] * (len(growth) - 1)]]
     if energy and size_ratio is not None:
-        outputs[0][1] = energy_slope(gas.diameter_sd / gas.diameter, size_ratio)
+        outputs[0][1] = energy_slope(gas.size_spread, size_ratio)
     if rotation:
         turning = ratio > 0
         by_rotation = (ratio + ROTATION_OFFSET) / jnp.where(turning, ratio, jnp.inf)
@@ -376,6 +376,7 @@ def _process_of_sizes(
 
     T, q = mean.log_temperature, mean.size_ratio
     steps = jnp.asarray([[STEP, -STEP, 0, 0, 0], [0, 0, STEP, -STEP, 0]], T.dtype)
+    pairs: PairRates
     at, pairs, changes = jax.vmap(rates)(T + steps[0], q + steps[1])
     jacobian = jnp.stack([at[0] - at[1], at[2] - at[3]], axis=1) / (2 * STEP)
     noise = changes[-1] @ pairs.squares[-1] @ changes[-1].T

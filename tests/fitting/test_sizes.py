@@ -33,13 +33,13 @@ def test_a_curve_without_noise_gives_its_own_constant(gas, curve, of_energy):
     if of_energy:
         T = T * np.asarray(energy_ratio(SPREAD, jnp.log(curve.size_ratio)))
     measured = jaxgran.CoolingCurve(np.asarray(curve.times), T)
-    measurement = jaxgran.Measurement(gas, measured, num_particles=250, of_energy=of_energy)
+    measurement = jaxgran.Measurement(gas, measured, num_particles=10**7, of_energy=of_energy)
     free = ("dissipative_constant", "temperature")
     result = jaxgran.fit(measurement, free=free, quick=True, progress=False)
     A, error = (float(np.squeeze(x)) for x in result.value("dissipative_constant"))
-    # The filter interpolates the noise; the curve itself is the model's.
-    assert A == pytest.approx(float(gas.value("dissipative_constant")), rel=2e-3)
-    assert 0.005 < error / A < 0.05
+    # Of many grains: the determinant of C prefers less noise, so a smaller A, by 1/N.
+    assert pytest.approx(float(gas.value("dissipative_constant")), rel=2e-3) == A
+    assert 1e-4 < error / A < 0.02
 
 
 def test_the_likelihood_is_differentiable_in_the_spread(gas, curve):

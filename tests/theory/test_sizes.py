@@ -10,6 +10,7 @@ import pytest
 import jaxgran
 from experiments.accuracy import size_statistics as runs
 from jaxgran.fitting.likelihood import Nodes, filtered
+from jaxgran.fitting.prediction import _compiled
 from jaxgran.fitting.rows import Noise
 from jaxgran.scene.gas import reduced_scene
 from jaxgran.theory import sizes
@@ -39,7 +40,7 @@ def test_stored_runs_cool_and_scatter_as_theory_says(name):
         # What was asked of theory; the mean of 400 runs has errors of .15 % and .01.
         assert abs(row["rate"]) < 0.01, row
         assert 0.9 < row["variance"] < 1.1, row
-        assert 0.75 < row["lowest"] and row["highest"] < 1.3, row
+        assert row["lowest"] > 0.75 and row["highest"] < 1.3, row
         assert abs(row["neighbours"]) < 0.05, row
 
 
@@ -170,7 +171,7 @@ def test_drag_alone_slows_small_spheres_more():
     np.testing.assert_allclose(curve.size_ratio, parts[0] / parts[1], rtol=1e-5)
 
 
-@pytest.mark.parametrize("energy", [False, True])
+@pytest.mark.parametrize("energy", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_the_filter_is_the_covariance(energy):
     gas = of_sizes(glass_beads(), 0.15)
     times = taus(gas, *np.concatenate([[0.0], np.geomspace(0.05, 50, 60)]))
@@ -193,7 +194,7 @@ def test_the_filter_is_the_covariance(energy):
     zero = jnp.zeros(())
     noise = Noise(jnp.full(1, 1 / 250), zero, jnp.zeros(times.size), zero, zero)
     batch = jax.tree.map(lambda x: jnp.asarray(x)[None], gas)
-    found, spread = filtered(
+    found, spread = _compiled(filtered, jax.default_backend())(
         batch,
         nodes,
         jnp.asarray(residuals),
