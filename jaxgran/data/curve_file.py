@@ -28,6 +28,9 @@ WANTED = "t,T[,T_err][,msd][,msd_err]"
 """Columns of a file, for messages."""
 
 CSV_FILE = f"a CSV file with the columns {WANTED}"
+OF_ENERGY = "energy: "
+"""Part of the entry T_from of a header where T was computed from a column of energies."""
+
 ANY_MATERIAL = {"density": "1", "Y": "1", "nu": "0", "T0": "1"}
 """Header keys that the collision frequency over sqrt(T0) does not depend on."""
 

@@ -20,7 +20,7 @@ from jaxgran._utils.validation import (
 )
 from jaxgran.data import files
 from jaxgran.data.curve import QUANTITIES, CoolingCurve
-from jaxgran.data.curve_file import CSV_FILE, FROM_ENERGY, read_data
+from jaxgran.data.curve_file import CSV_FILE, OF_ENERGY, read_data
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.header import (
     ABSENT,
@@ -266,7 +266,7 @@ def read_measurement(
             ensemble_start=header_choice(entries, "T0_of", ("run", "ensemble")) == "ensemble",
             calibration_error=files.header_number({"T_scale_err": "0"} | entries, "T_scale_err"),
             errors_measured=header_choice(entries, "errors", ("any", "measured")) == "measured",
-            of_energy=entries.get("T_from") == FROM_ENERGY,
+            of_energy=OF_ENERGY in entries.get("T_from", ""),
             rounding=content.rounding,
             guesses=guesses_of_header(entries),
             header=tuple(entries.items()),
