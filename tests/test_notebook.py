@@ -141,9 +141,16 @@ def test_a_fit_is_drawn_with_its_residuals():
 
 
 def test_a_fit_of_several_measurements_is_not_drawn():
-    drops = jaxgran.DropTest([0.1, 0.3], [0.92, 0.9], [0.01, 0.01])
-    measurement = jaxgran.Measurement(glass_beads(), drops)
-    several = jaxgran.fit({"first": measurement, "second": measurement}, quick=True)
+    each = {"first": [0.92, 0.9], "second": [0.91, 0.9]}
+    several = jaxgran.fit(
+        {
+            name: jaxgran.Measurement(
+                glass_beads(), jaxgran.DropTest([0.1, 0.3], eps, [0.01, 0.01])
+            )
+            for name, eps in each.items()
+        },
+        quick=True,
+    )
     with pytest.raises(ValueError, match="one curve, got one of first, second. Draw each"):
         jaxgran.plot_fit(several)
     pyplot.close("all")

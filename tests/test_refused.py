@@ -354,10 +354,12 @@ CALLS = [
     (lambda: jaxgran.RestitutionSpline([0.1, 1.0], [0.9, 0.8, 0.7]), "must be 2 numbers"),
     (lambda: jaxgran.RestitutionSpline([0.1, 1.0], [0.9, 0.8], 0.0), "smoothness"),
 ]
-TWO = {"a": measured(DROPS), "b": measured(DROPS)}
+OTHER_DROPS = dataclasses.replace(DROPS, restitution=DROPS.restitution - 0.01)
+LATER = dataclasses.replace(CURVE, times=CURVE.times + 1.0)
+TWO = {"a": measured(DROPS), "b": measured(OTHER_DROPS)}
 DISAGREE = {
-    name: measured(DROPS, priors={"youngs_modulus": (Y, 1e6)})
-    for name, Y in {"a": 5e7, "b": 6e7}.items()
+    "a": measured(DROPS, priors={"youngs_modulus": (5e7, 1e6)}),
+    "b": measured(OTHER_DROPS, priors={"youngs_modulus": (6e7, 1e6)}),
 }
 FITS = [
     ({"free": "amplitude"}, "no float 'amplitude'"),
@@ -381,7 +383,10 @@ FITS = [
         {"measurement": measured(priors={"t0": (0.0, 1.0)}), "model": DSMC},
         "t0 is fitted through kinetic theory only",
     ),
-    ({"measurement": {"a": measured(), "b": measured()}, "free": (A, "t0")}, "each has its own t0"),
+    (
+        {"measurement": {"a": measured(), "b": measured(LATER)}, "free": (A, "t0")},
+        "each has its own t0",
+    ),
     # models with noise
     (
         {"measurement": measured(priors={T_0: (0.01, 1e-4)}), "model": DSMC, "free": (A, T_0)},

@@ -89,6 +89,7 @@ def test_no_alternatives_of_a_curve_in_other_units():
         assert "check the units, the scale of T and T0" in str(fit.reasons)
 
 
+@pytest.mark.filterwarnings("ignore:this curve does not determine")
 def test_a_curve_that_rises_is_not_explained_by_scatter():
     curve = jaxgran.CoolingCurve([1.0, 2.0, 3.0, 4.0], [0.01, 0.011, 0.012, 0.013])
     fit = fitted(GAS, curve, quick=True)
