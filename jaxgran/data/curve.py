@@ -19,6 +19,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from jaxgran._utils import status as fault_status
 from jaxgran._utils.formatting import format_quantity, text_table
 from jaxgran._utils.validation import list_to_array
 
@@ -290,7 +291,7 @@ class CoolingCurve(eqx.Module):
         Args:
             times: t, s, shape (times,).
             values: fields of the curve by name, each of shape (replicas, times).
-            others: further fields, used unchanged.
+            others: further fields, used unchanged; the status is ok by default.
         """
         means: dict[str, Any] = {name: jnp.mean(value, axis=0) for name, value in values.items()}
         num_replicas = len(values["temperature"])
@@ -299,6 +300,7 @@ class CoolingCurve(eqx.Module):
                 # At t = 0 all replicas agree, and the derivative of a root at 0 is not finite.
                 deviation = jnp.std(jax.lax.stop_gradient(values[name]), axis=0, ddof=1)
                 means[f"{name}_error"] = deviation / num_replicas**0.5
+        others.setdefault("status", jnp.asarray(fault_status.OK, jnp.int32))
         return cls(times=times, **means, replicas=cls(times=times, **values), **others)
 
     def with_saved(self, each: Any) -> "CoolingCurve":

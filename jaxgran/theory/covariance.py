@@ -69,7 +69,7 @@ the whitened variance is .88 and .83.
 """
 
 WALL_MEMORY = np.array([[5.5, 8.0], [-8.0, 5.5]])
-"""M. Of the Poissonian variance of what walls take in a time t it leaves .84, .64, .37, .21 for
+"""M. Of the Poissonian variance of what walls take in a time t it leaves .83, .63, .36, .20 for
 ``t sqrt(T)/W`` = .1, .2, .4, 1.6."""
 
 WALL_KICK = np.array([1.0, 0.67])
