@@ -266,15 +266,18 @@ def _as_curve(m: CurveRows, computed: dict[str, Any]) -> CoolingCurve:
 def describe_gas(gas: Gas, m: CurveRows) -> dict[str, float]:
     """Return numbers that describe a fitted gas: see `Fit.scales`."""
     N = m.measurement.num_particles
-    coolest = float(m.values[above_noise(m.curve), 0][-1])
-    numbers = _scales(gas, coolest, N or 1)
-    described = {name: float(x) for name, x in numbers.items()}
-    return described if N is not None else described | {"side": float("nan")}
+    coolest = m.values[above_noise(m.curve), 0][-1]
+    # An array: a number of Python would be a constant of a program of its own.
+    numbers = _scales(gas, jnp.asarray(coolest))
+    scales = {name: float(x) for name, x in numbers.items()}
+    volume = scales.pop("volume")
+    side = float("nan") if N is None else (N * volume) ** (1 / gas.dimension)
+    return scales | {"side": side}
 
 
 @eqx.filter_jit
-def _scales(gas: Gas, last: Any, N: int) -> dict[str, Array]:
-    speeds = jnp.sqrt(2 * jnp.stack([gas.temperature, jnp.asarray(last)]))
+def _scales(gas: Gas, last: Array) -> dict[str, Array]:
+    speeds = jnp.sqrt(2 * jnp.stack([gas.temperature, last]))
     first, at_last = gas.restitution(speeds)
     scales = {
         "phi": gas.packing_fraction,
@@ -283,7 +286,7 @@ def _scales(gas: Gas, last: Any, N: int) -> dict[str, Array]:
         "eps_first": first,
         "eps_last": at_last,
         "mean_free_path": gas.mean_free_path,
-        "side": gas.box_side(N),
+        "volume": 1 / gas.number_density,
     }
     if hasattr(gas.law, "dissipative_constant"):
         scales["beta"] = gas.thermal_beta
