@@ -48,10 +48,6 @@ def test_links_lead_somewhere(path):
             assert anchor in names, f"{path.name}: {other.name} has no heading {anchor}"
 
 
-def test_the_first_page_is_short():
-    assert len((ROOT / "README.md").read_bytes()) <= 6144
-
-
 @pytest.mark.slow
 def test_python_of_the_documents_runs():
     names, pages = {}, (ROOT / "README.md", EXPERIMENTS / "guide.md")
