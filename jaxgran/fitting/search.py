@@ -13,11 +13,11 @@ from tqdm import tqdm
 
 from jaxgran.fitting.problem import Evaluation, Problem
 
-CONVERGED_STEP = 0.03
-"""Length of a Newton step, in standard errors, below which a search has converged."""
+LAST_STEP = 0.01
+"""Length of a Newton step, in standard errors, below which a search ends."""
 
-DESCENT_STEP = 0.01
-"""The same of a descent, which does not take that step."""
+CONVERGED_STEP = 0.03
+"""The same below which a search that ends has converged."""
 
 STALLED_STEP = 0.3
 """The same where no step along it lowers -2 ln L: at a kink, where a measured point passes t0."""
@@ -118,7 +118,7 @@ def newton_step(found: Evaluation) -> tuple[np.ndarray, float]:
 
 
 def minimise(
-    problem: Problem, first: np.ndarray, max_steps: int, tolerance: float = CONVERGED_STEP
+    problem: Problem, first: np.ndarray, max_steps: int, tolerance: float = LAST_STEP
 ) -> Minimum:
     """Minimise -2 ln L from a first guess by Newton's method in a trust region.
 
@@ -179,7 +179,7 @@ def minimise(
         },
     )
     end = np.asarray(solution.x)
-    limit = max(tolerance, STALLED_STEP) if stalled >= MAX_STALLED else tolerance
+    limit = max(tolerance, STALLED_STEP if stalled >= MAX_STALLED else CONVERGED_STEP)
     step, length = newton_step(problem.evaluate(end))
     if length < CONVERGED_STEP:
         end = end + step
@@ -239,7 +239,7 @@ class Descent:
             found = problem.evaluate(flat)
             if not found.is_finite:
                 return np.inf, found.gradient, False
-            return found.value, found.gradient, newton_step(found)[1] < DESCENT_STEP
+            return found.value, found.gradient, newton_step(found)[1] < LAST_STEP
 
         size = sum(row.values.size for row in problem.evaluate(first).rows)
         course = self.descend(loss, first, max_steps, size, problem.estimates, noisy=False)
@@ -302,7 +302,7 @@ class Descent:
                     break
                 converged = at_minimum or _has_ceased(losses, noisy)
                 if converged:
-                    reason = f"the next Newton step is below {DESCENT_STEP:g} standard errors"
+                    reason = f"the next Newton step is below {LAST_STEP:g} standard errors"
                     if not at_minimum:
                         steps = WINDOW if noisy else PATIENCE
                         reason = f"-2 ln L no longer falls, in {steps} steps"

@@ -218,9 +218,15 @@ class Simulations:
         estimates = []
         noises = []
         p = near[-1].flat.size
+        slopes = np.mean([s.slope for s in near], axis=0)
         for s in near:
             difference = self.measured - s.values
-            columns = np.concatenate([difference[:, None], s.slope, s.deviation.T], axis=1)
+            # The noise of a run's slope goes with that of its values, which would move the
+            # estimate: the slope is that of the other runs.
+            slope = s.slope
+            if len(near) > 1:
+                slope = slopes + (slopes - s.slope) / (len(near) - 1)
+            columns = np.concatenate([difference[:, None], slope, s.deviation.T], axis=1)
             columns = curve.whiten(columns)
             gain = np.linalg.pinv(columns[:, 1 : 1 + p], rcond=resolution)
             estimates.append(s.flat + gain @ columns[:, 0])
@@ -229,7 +235,6 @@ class Simulations:
             noises.append(shift @ shift.T)
         flat = np.mean(estimates, axis=0)
         differences = [self.measured - s.values - s.slope @ (flat - s.flat) for s in near]
-        slopes = np.mean([s.slope for s in near], axis=0)
         columns = np.concatenate([np.mean(differences, axis=0)[:, None], slopes], axis=1)
         columns = curve.whiten(columns)
         sensitivity = columns[:, 1:]

@@ -86,8 +86,8 @@ def reads_one_rule_in_both_directions(found):
 def finds_A(found):
     for row in found["rows"]:
         assert len(row["guesses"]) == row["all_simulations"] > 0
-        if row["search"] == "jaxgran.fit":
-            assert abs(row["last_error"][0]) < 2.5 * row["standard_error"][0] < 0.5
+        if row["search"] == "jaxgran.fit":  # 1000 spheres leave A open by some per cent
+            assert abs(row["last_error"][0]) < 0.15
 
 
 C1 = 1.153449

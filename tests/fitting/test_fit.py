@@ -39,14 +39,14 @@ def test_guess_uses_the_data_not_the_gas():
 @pytest.mark.slow
 @pytest.mark.figures
 def test_intervals_cover_the_truth(record):
-    # 100 noisy curves: a 95 % interval must cover in 90.6 to 99.4 % (2 standard errors).
+    # 300 noisy curves: a 95 % interval must cover in 92.5 to 97.5 % (2 standard errors).
     gas = glass_beads(0.15)
     truth = np.array([gas.value(name) for name in BOTH])
 
     # The points have errors of 1e-2: a tolerance of 1e-6 takes a third of the steps of the default.
     model = jaxgran.KineticTheory(rtol=1e-6)
     inside, reduced = [], []
-    for key in jax.random.split(jax.random.key(0), 100):
+    for key in jax.random.split(jax.random.key(0), 300):
         curve = synthetic(gas, key, model=model)
         result = fitted(gas, curve, free=BOTH, model=model, num_particles=10**7)
         assert result.converged
@@ -55,8 +55,8 @@ def test_intervals_cover_the_truth(record):
         inside.append(np.abs(result.estimate - truth) < 1.959964 * error)
         reduced.append(result.reduced_chi2)
     coverage = np.mean(inside, axis=0)
-    assert np.all((coverage >= 0.906) & (coverage <= 0.994)), coverage
-    np.testing.assert_allclose(np.mean(reduced), 1.0, atol=0.05)  # 38 d.o.f., 100 curves: 0.023
+    assert np.all((coverage >= 0.925) & (coverage <= 0.975)), coverage
+    np.testing.assert_allclose(np.mean(reduced), 1.0, atol=0.05)  # 38 d.o.f., 300 curves: 0.013
     record("intervals", coverage=coverage.tolist())
 
 

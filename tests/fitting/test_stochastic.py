@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxgran
+from jaxgran.fitting import simulations
 from tests.beads import glass_beads, soft_beads
 from tests.fitting.curves import BOTH, A, deviation, rough_beads, synthetic
 from tests.fitting.curves import fitted as fit_measured
@@ -105,6 +106,42 @@ def test_a_biased_slope_does_not_move_the_answer(bias):
     # What is left is what a biased step leaves of the last step, 20 % of less than a tenth.
     np.testing.assert_allclose(logs(quiet.gas), TRUTH, atol=0.02)
     assert quiet.converged and quiet.iterations <= 8
+
+
+class Captured(Exception):
+    pass
+
+
+@pytest.mark.slow
+def test_noise_of_slopes_does_not_move_the_answer(monkeypatch):
+    """Runs whose noise grows with A: the noise of a slope is that of the values, times 3."""
+    captured = []
+
+    def capture(sims, first, max_simulations):
+        captured.append((sims, first))
+        raise Captured
+
+    monkeypatch.setattr(simulations, "_by_gauss_newton", capture)
+    with pytest.raises(Captured):
+        fitted(StandIn(noise=1e-6), first=TRUTH)
+    ((sims, flat),) = captured
+    exact, _ = sims.run(flat, 0)
+    rng = np.random.default_rng(0)
+    half = exact.values.size // 2  # T_rot is not compared
+
+    def noisy():
+        steps = 0.1 * rng.standard_normal((4, half)) / half**0.5
+        each = np.pad(np.cumsum(steps, axis=1), ((0, 0), (0, half)))
+        mean = each.mean(axis=0)
+        slope = exact.slope + np.stack([3.0 * mean, 0.0 * mean], axis=1)
+        variance = np.full(2 * half, each.var() / 3)
+        return exact._replace(
+            values=exact.values + mean, slope=slope, deviation=each - mean, variance=variance
+        )
+
+    off = np.array([sims.average([noisy(), noisy()]).flat - flat for _ in range(400)])
+    error = off.std(axis=0) / len(off) ** 0.5
+    assert np.all(np.abs(off.mean(axis=0)) < 3 * error)
 
 
 class OneRun(StandIn):
