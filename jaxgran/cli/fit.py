@@ -123,15 +123,21 @@ def with_absent(measurement: jaxgran.Measurement, absent: Sequence[str]) -> jaxg
     )
 
 
+def _constant_of(measurements: dict[str, jaxgran.Measurement]) -> str:
+    """Return the symbol of the constant of the law that several measurements share."""
+    gas = next(iter(measurements.values())).gas
+    return "eps" if "coefficient" in gas.domains else "A"
+
+
 def parameters_of(
     options: FitOptions, measurements: dict[str, jaxgran.Measurement]
 ) -> dict[str, Any]:
     """Return the arguments `free` and `separate` of the fit."""
     is_single = [*measurements] == [""]
-    free = options.free or (() if is_single else ("A", "T0"))
+    free = options.free or (() if is_single else (_constant_of(measurements), "T0"))
     if free and "A" not in free:
         for measurement in measurements.values():
-            if "A" not in dict(measurement.header):
+            if not {"A", "eps"} & dict(measurement.header).keys():
                 raise ValueError(
                     f"--free {' '.join(free)} leaves A fixed, and the file does not give it. Add "
                     "--set A=VALUE (in s), or free A too."

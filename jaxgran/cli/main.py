@@ -107,8 +107,9 @@ def cool(
     """Compute the cooling curve of a scene; write it as a CSV file and a picture.
 
     Args:
-        scene: TOML file with eta, diameter, density, Y, nu, T0 and A (SI), or the CSV file of a
-            curve with these keys in its header.
+        scene: TOML file with eta, diameter, density, Y, nu, T0 and A (SI; eps, a constant
+            restitution, may replace Y, nu and A), or the CSV file of a curve with these keys in its
+            header.
         until: Last time, s; needed for a TOML file, by default the times are those of the CSV file.
         model: Model to use.
         particles: Number of particles per replica (particle models only; default: N from the
@@ -206,15 +207,18 @@ def _read_scene(path: Path, until: float | None, fits_A: bool = False) -> Simple
         header = dict(measurement.header)
         gas = measurement.gas
         times = measurement.curve.times
-        if "A" not in header and fits_A:
+        if not {"A", "eps"} & header.keys() and fits_A:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # on the fit
                 fitted = jaxgran.fit(measurement, quick=True)
             gas = fitted.gas
             header["A"] = repr(float(gas.value("dissipative_constant")))
             print(f"A = {float(header['A']):.4g} s is that of a fit of this curve")
-    if "A" not in header:
-        raise ValueError(f"{path} does not give A, in s. Add it, or estimate it with jaxgran fit.")
+    if not {"A", "eps"} & header.keys():
+        raise ValueError(
+            f"{path} does not give A, in s, or eps, a constant restitution. Add one, or estimate A "
+            "with jaxgran fit."
+        )
     if until is not None:
         first = float(gas.mean_free_time) / 10
         if not first < until < float("inf"):

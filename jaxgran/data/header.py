@@ -20,7 +20,7 @@ from jaxgran.scene.elements import (
 )
 from jaxgran.scene.gas import ELEMENTS, Gas
 from jaxgran.scene.geometry import sphere_mass
-from jaxgran.scene.laws import Viscoelastic
+from jaxgran.scene.laws import ConstantRestitution, RestitutionLaw, Viscoelastic
 from jaxgran.scene.parameters import BY_SYMBOL, REQUIRED, fields_of
 
 OPTIONAL_KEYS = (
@@ -65,6 +65,9 @@ ABSENT = {
 MEASURED = "measured"
 """Value of the header key ``errors``: T_err is the error of the measurement, whatever its size."""
 
+VISCOELASTIC_KEYS = ("Y", "nu", "A")
+"""Header keys of the law of viscoelastic spheres, which eps replaces."""
+
 ANY_GAS = {"eta": "0.1", "T0": "0.01"}
 """Header keys that single impacts do not depend on."""
 
@@ -100,11 +103,11 @@ def gas_of_header(header: dict[str, str]) -> tuple[Gas, list[str]]:
     Args:
         header: in SI: eta (the packing fraction), diameter (m; the mean one), density (of the
             material, kg/m^3), Y (Pa), nu, T0 (m^2/s^2) and, if it is not 3, dimension; A (s), 0 by
-            default; where sizes differ diameter_sd, their standard deviation (m); for rough
+            default; eps in place of Y, nu and A for a constant restitution; where sizes differ diameter_sd, their standard deviation (m); for rough
             spheres, walls, drag and a drive also the keys of `elements_of_header`.
 
     Returns:
-        A gas of viscoelastic spheres, and a question for each value that is not usual in a granular
+        A gas, and a question for each value that is not usual in a granular
         gas, and for unknown keys.
 
     Raises:
@@ -171,18 +174,20 @@ def make_gas(header: dict[str, str]) -> Gas:
         sphere *= 1 + (2 * d - 3) * spread**2
         volume = np.prod(np.broadcast_to(header_sides(header), d))
         header = header | {"eta": repr(float(files.header_number(header, "N") * sphere / volume))}
-    missing = [key for key in REQUIRED if key not in header]
+    missing = missing_keys(header)
     if missing:
         raise ValueError(
             f"the header lacks {', '.join(missing)}; add lines such as '# {missing[0]}: VALUE' "
-            f"(needed: {', '.join(REQUIRED)}; in SI units, or with a unit behind the value)"
+            f"(needed: {', '.join(REQUIRED)}; in SI units, or with a unit behind the value; "
+            "'# eps: VALUE', a constant restitution, replaces Y and nu)"
         )
-    values = {key: files.header_number(header, key) for key in REQUIRED}
+    scene_keys = (key for key in REQUIRED if key not in VISCOELASTIC_KEYS)
+    values = {key: files.header_number(header, key) for key in scene_keys}
     sizes: dict[str, Any] = {}
     if "diameter_sd" in header:
         sizes["diameter_sd"] = files.header_number(header, "diameter_sd")
     gas = Gas(
-        Viscoelastic(values["Y"], values["nu"], files.header_number({"A": "0"} | header, "A")),
+        law_of_header(header),
         diameter=values["diameter"],
         mass=sphere_mass(values["diameter"], values["density"]),
         packing_fraction=values["eta"],
@@ -200,6 +205,29 @@ def make_gas(header: dict[str, str]) -> Gas:
                 f"eta = {eta * ratio:.4g}, but the header gives {eta:.4g}; correct one of them"
             )
     return gas
+
+
+def missing_keys(header: Mapping[str, str]) -> list[str]:
+    """Return the keys that a header must give and does not."""
+    replaced = VISCOELASTIC_KEYS if "eps" in header else ()
+    return [key for key in REQUIRED if key not in header and key not in replaced]
+
+
+def law_of_header(header: dict[str, str]) -> RestitutionLaw:
+    """Return the law of restitution: constant with the key eps, else of viscoelastic spheres.
+
+    Raises:
+        ValueError: for keys of both laws.
+    """
+    if "eps" not in header:
+        entries = {"A": "0"} | header
+        return Viscoelastic(*(files.header_number(entries, key) for key in VISCOELASTIC_KEYS))
+    if both := [key for key in VISCOELASTIC_KEYS if key in header]:
+        raise ValueError(
+            f"the header gives eps, a constant restitution, and {', '.join(both)} of viscoelastic "
+            f"spheres: leave out eps or {', '.join(both)}"
+        )
+    return ConstantRestitution(files.header_number(header, "eps"))
 
 
 def elements_of_header(header: dict[str, str]) -> dict[str, Any]:

@@ -30,10 +30,10 @@ from jaxgran.data.header import (
     gas_of_header,
     guesses_of_header,
     header_choice,
+    missing_keys,
     priors_of_header,
 )
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.parameters import REQUIRED
 
 START_TIME = "t0"
 """Name of the time, on the clock of the measurement, at which the gas had its temperature T_0 and
@@ -247,7 +247,7 @@ def read_measurement(
         questions = content.questions
         if isinstance(content.data, DropTest) and gas is None:
             entries = ANY_GAS | entries
-            if missing := [key for key in REQUIRED if key not in entries]:
+            if missing := missing_keys(entries):
                 raise ValueError(
                     f"the header of this drop test lacks {', '.join(missing)}: add them, or give "
                     "the gas of a curve, by gas=... or by jaxgran fit CURVE.csv --drop-test"

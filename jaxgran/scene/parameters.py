@@ -48,7 +48,7 @@ _ROWS = (
     ("temperature", "T0", "m^2/s^2", POSITIVE, SCENE, "Gas"),
     ("packing_fraction", "eta", "", FRACTION, SCENE, "Gas"),
     ("t0", "t0", "s", ANY, SCENE),
-    ("coefficient", "", "", FRACTION, MATERIAL, "ConstantRestitution"),
+    ("coefficient", "eps", "", FRACTION, MATERIAL, "ConstantRestitution"),
     ("tangential_restitution", "beta_t", "", TANGENTIAL, MATERIAL, "Rough"),
     ("tangential_damping", "tangential_damping", "", NON_NEGATIVE, MATERIAL, "Frictional"),
     ("friction", "friction", "", NON_NEGATIVE, MATERIAL, "Frictional", "Rough"),
@@ -77,7 +77,7 @@ FLOAT_UNITS = {p.name: p.unit for p in PARAMETERS.values() if p.unit}
 """Unit of each parameter that has one."""
 
 REQUIRED = ("eta", "diameter", "density", "Y", "nu", "T0")
-"""Symbols that a curve file must give."""
+"""Symbols that a curve file must give; eps, a constant restitution, may replace Y and nu."""
 
 PREFIXES = {"Walls": "wall_", "StokesDrag": "drag_", "WhiteNoise": "drive_"}
 """Prefix of the names of the floats of an element in `Gas`, by class."""
