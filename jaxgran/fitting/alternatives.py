@@ -17,6 +17,7 @@ import scipy
 from jaxtyping import Float
 
 from jaxgran.data.measurement import START_TIME
+from jaxgran.fitting.goodness import SIGNIFICANCE, goodness
 from jaxgran.fitting.parameters import as_floats, with_floats
 from jaxgran.fitting.prediction import FLOOR, WHITE
 from jaxgran.fitting.problem import Problem
@@ -266,6 +267,10 @@ def compare_alternatives(
     ]
     best = min([*bases, *trials], key=lambda trial: trial.value)
     significant = float(scipy.stats.chi2.isf(PREFERENCE_LEVEL / max(len(kinds), 1), 1))
+    found = problem.evaluate(bases[0].flat)
+    if goodness(problem, found)["smooth_p_value"] < SIGNIFICANCE / 2:
+        # Such a curve prefers whatever has less noise.
+        significant = np.inf
     summary = _Summary(problem, bases[0], best, significant, noise)
     law = summary.of(None, [[base] for base in bases])
     alternatives = [summary.of(kind, found, law) for kind, found in profiles.items()]

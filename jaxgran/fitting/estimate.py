@@ -14,7 +14,7 @@ from jaxgran.data.curve import CoolingCurve, above_noise
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.alternatives import Explanations, compare_alternatives
-from jaxgran.fitting.goodness import goodness, measurement_share
+from jaxgran.fitting.goodness import SIGNIFICANCE, goodness, measurement_share
 from jaxgran.fitting.information import (
     DEGENERATE,
     covariance_of_minima,
@@ -24,7 +24,7 @@ from jaxgran.fitting.information import (
     undetermined,
     weights_of_measurements,
 )
-from jaxgran.fitting.messages import SIGNIFICANCE, say, with_words
+from jaxgran.fitting.messages import say, with_words
 from jaxgran.fitting.outliers import without_outliers
 from jaxgran.fitting.parameters import as_floats, with_floats
 from jaxgran.fitting.problem import Evaluation, Problem

@@ -9,6 +9,9 @@ from jaxgran.fitting.prediction import Residuals
 from jaxgran.fitting.problem import Evaluation, Problem
 from jaxgran.fitting.rows import SCATTER
 
+SIGNIFICANCE = 0.01
+"""Level of significance of the test of the misfit, half of it on each side."""
+
 
 def goodness(problem: Problem, found: Evaluation) -> dict[str, Any]:
     """Return chi^2, its degrees of freedom, and its probabilities by chance.

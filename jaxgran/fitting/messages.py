@@ -12,12 +12,10 @@ import scipy  # which imports scipy.stats at its first use
 
 from jaxgran.data.drop_test import DropTest
 from jaxgran.fitting.alternatives import DECLARABLE, Explanations
+from jaxgran.fitting.goodness import SIGNIFICANCE
 from jaxgran.fitting.result import CONDITIONAL, Fit
 from jaxgran.models.base import Limitation
 from jaxgran.scene.parameters import symbol_of, unit_of
-
-SIGNIFICANCE = 0.01
-"""Level of significance of the test of the misfit, half of it on each side."""
 
 RISING_SIGNIFICANCE = 0.05
 """Level at which T is found to rise: of four rising values the probability by chance is 0.04."""
