@@ -458,7 +458,8 @@ def covariance_at_all_times(
     earlier = jnp.moveaxis(rows, 0, 1)  # output and time, output and time that is not later
     later = jnp.transpose(earlier, (2, 3, 0, 1))
     whole = jnp.where(index[:, None, None] >= column, earlier, later)
-    return whole.reshape(num_outputs * num_times, num_outputs * num_times)
+    square = whole.reshape(num_outputs * num_times, num_outputs * num_times)
+    return (square + square.T) / 2  # blocks of one time differ from it by roundings
 
 
 def product(a: Float[Array, "i j #n"], b: Float[Array, "j k #n"]) -> Float[Array, "i k n"]:
