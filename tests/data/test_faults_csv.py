@@ -587,3 +587,13 @@ def test_two_copies_are_one_measurement(write):
         copies = {"a": first, "b": read_measurement(write(other))}
         with pytest.raises(ValueError, match="'a' and 'b' hold the same values"):
             jaxgran.fit(copies)
+
+
+def test_constant_restitution_has_a_key():
+    gas = gas_of(eps=0.9, Y=None, nu=None)
+    assert isinstance(gas.law, jaxgran.ConstantRestitution)
+    assert float(gas.value("coefficient")) == 0.9
+    with pytest.raises(ValueError, match="gives eps, .* and Y, nu of viscoelastic"):
+        gas_of(eps=0.9)
+    with pytest.raises(ValueError, match="lacks nu; .* eps: VALUE"):
+        gas_of(nu=None)

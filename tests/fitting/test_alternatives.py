@@ -46,6 +46,18 @@ def test_dense_measured_curve_is_not_explained():
         assert word in text
 
 
+@pytest.mark.slow
+def test_a_curve_smoother_than_told_prefers_nothing():
+    gas = dataclasses.replace(glass_beads(), law=jaxgran.ConstantRestitution(0.9))
+    curve = synthetic(gas, end=100.0)
+    curve = jaxgran.CoolingCurve(curve.times, curve.temperature)
+    result = jaxgran.fit(jaxgran.Measurement(gas, curve, num_particles=1000))
+    assert result.grade == "not consistent" and "scatters less" in " ".join(result.reasons)
+    # Rough grains scatter less, but the curve is not closer to theirs.
+    assert max(x.improvement for x in result.alternatives) > 11
+    assert in_range(result, 0.9, "coefficient")
+
+
 def models_of(n):
     particles = jaxgran.DSMC(n), jaxgran.HardSpheres(n), jaxgran.SoftSpheres(n)
     return jaxgran.KineticTheory(), *particles
