@@ -32,6 +32,7 @@ def scene(tmp_path, monkeypatch):
     (tmp_path / "scene.toml").write_text(SCENE)
     (tmp_path / "folder").mkdir()
     (tmp_path / "bad.toml").write_text("eta : 0.05\n")
+    (tmp_path / "tables.toml").write_text(SCENE + "[walls]\nside = 0.1\n")
     (tmp_path / "no_A.toml").write_text(SCENE.replace("A = 3e-6", ""))
     return tmp_path
 
@@ -214,6 +215,9 @@ def test_a_single_curve_begins_with_the_range(measured, fit):
     assert list(answer)[:3] == ["A", "A_low", "A_high"] and answer["verdict"] == "determined"
     assert "assuming no other effect" in out and "absent: walls, roughness, drag" in out
     assert not any(word in out for word in ("walls that dissipate", "rough grains", "linear drag"))
+    in_python = jaxgran.fit(jaxgran.read_measurement("thin.csv", {"absent": "walls roughness drag"}))
+    ends = [float(end[0]) for end in in_python.ranges["dissipative_constant"]]
+    assert ends == [answer["A_low"], answer["A_high"]]
     out, answer = fit("thin.csv", "--absent", "drag", "--quick", "--explain", "--overwrite")
     assert "alternatives were not compared" in out and answer["A_low"] is None
     assert "error of A, in per cent" in out and "the model's cooling rate in this scene" in out
@@ -236,6 +240,7 @@ BAD_INPUT = {
     "cool scene.toml --until 1 --key 1e30": "whole number below 2^63",
     "fit nowhere.csv --tolerance nan": "--tolerance must lie in (0, inf), got nan",
     "cool bad.toml --until 1": "not TOML",
+    "cool tables.toml --until 1": "[walls] is not read: write all keys without tables",
     "choose no_A.toml --until 1": "does not give A",
     "fit thin.csv thin.csv": "given twice",
     "fit thin.csv dense.csv --model dsmc": "fitted with kinetic-theory",

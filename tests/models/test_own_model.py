@@ -36,7 +36,7 @@ def test_fit_finds_what_made_the_curve():
         assert abs(estimate - gas.value(name)) < 3 * error
         assert error < 0.01 * gas.value(name)
     assert np.all(result.error_budget["model"] > 0)
-    known = "Haff law is consistent with this curve, which determines coefficient: "
+    known = "Haff law is consistent with this curve, which determines eps: "
     assert result.grade == "determined" and result.verdict.startswith(known)
     low, high = result.ranges["coefficient"]
     assert low < 0.9 < high
