@@ -215,7 +215,9 @@ def test_a_single_curve_begins_with_the_range(measured, fit):
     assert list(answer)[:3] == ["A", "A_low", "A_high"] and answer["verdict"] == "determined"
     assert "assuming no other effect" in out and "absent: walls, roughness, drag" in out
     assert not any(word in out for word in ("walls that dissipate", "rough grains", "linear drag"))
-    in_python = jaxgran.fit(jaxgran.read_measurement("thin.csv", {"absent": "walls roughness drag"}))
+    in_python = jaxgran.fit(
+        jaxgran.read_measurement("thin.csv", {"absent": "walls roughness drag"})
+    )
     ends = [float(end[0]) for end in in_python.ranges["dissipative_constant"]]
     assert ends == [answer["A_low"], answer["A_high"]]
     out, answer = fit("thin.csv", "--absent", "drag", "--quick", "--explain", "--overwrite")

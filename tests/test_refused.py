@@ -249,6 +249,9 @@ CALLS = [
     (lambda: measured(errors_measured="no"), "errors_measured must be True or False"),
     (lambda: measured(absent=("gravity",)), "absent must be a tuple of walls, roughness, drag"),
     (lambda: measured(absent="walls"), "absent must be a tuple of walls, roughness, drag"),
+    (lambda: measured(absent=5), "absent must be a tuple of walls, roughness, drag.*got 5"),
+    (lambda: measured(rounding={"temperature": [1e-6, 1e-6]}), "one for each time, got shape .2,"),
+    (lambda: measured(guesses=("beta",)), "guesses must be a tuple of .*got .'beta'"),
     (lambda: measured(NO_VALUES), "displacement_error without the values"),
     (lambda: measured(priors=[(PHI, 0.05, 0.01)]), "priors must be a dictionary of names"),
     (

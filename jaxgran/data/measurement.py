@@ -164,7 +164,11 @@ class Measurement(eqx.Module):
             "calibration_error", calibration_error, NON_NEGATIVE, "0.02 stands for 2 %."
         )
         self.errors_measured = errors_measured
-        self.rounding = checked_rounding({} if rounding is None else rounding)
+        self.rounding = checked_rounding({} if rounding is None else rounding, data)
+        if isinstance(guesses, str) or not set(guesses) <= {*gas.domains}:
+            raise ValueError(
+                f"guesses must be a tuple of {', '.join(gas.domains)}, got {guesses!r:.60}"
+            )
         self.guesses = tuple(guesses)
         self.header = tuple(header)
 
@@ -276,7 +280,7 @@ def read_measurement(
     return measurement
 
 
-def checked_rounding(rounding: Any) -> dict[str, Array]:
+def checked_rounding(rounding: Any, data: CoolingCurve | DropTest) -> dict[str, Array]:
     """Return last digits of the fields of a curve as arrays, or raise ValueError."""
     fields = ("temperature", "rotational_temperature")
     if not isinstance(rounding, dict) or not set(rounding) <= set(fields):
@@ -288,12 +292,17 @@ def checked_rounding(rounding: Any) -> dict[str, Array]:
     for name, digit in rounding.items():
         converted[name] = float_array(digit, f"rounding of {name}")
         NON_NEGATIVE.check(f"rounding of {name}", converted[name], "Give the last digit, SI.")
+        shape = converted[name].shape
+        if shape and (not isinstance(data, CoolingCurve) or shape != data.times.shape):
+            raise ValueError(
+                f"rounding of {name} must be one number or one for each time, got shape {shape}"
+            )
     return converted
 
 
 def checked_absent(absent: Any) -> tuple[str, ...]:
     """Return the names of effects that a user declares absent, or raise ValueError."""
-    if isinstance(absent, str) or not set(absent) <= set(ABSENT):
+    if not isinstance(absent, tuple | list) or not set(absent) <= set(ABSENT):
         raise ValueError(f"absent must be a tuple of {', '.join(ABSENT)}, got {absent!r}")
     return tuple(absent)
 
