@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 PROGRAMS = "JAXGRAN_TEST_PROGRAMS"
-"""An environment variable: the folder of programs compiled in this run of the tests."""
+"""An environment variable: the folder of programs compiled in this run of the tests. Runs one after
+the other may share a given one."""
 
 MAX_MAPS_AFTER_A_FILE = 12_000
 """Memory maps above which a process clears its caches after a file of tests. Linux allows 65530;
@@ -60,8 +61,9 @@ def pytest_configure(config):
         os.environ["MPLBACKEND"] = "agg"  # no window
         for name in ("JAX_COMPILATION_CACHE_DIR", "JAXGRAN_NO_CACHE"):
             os.environ.pop(name, None)
-        os.environ[PROGRAMS] = tempfile.mkdtemp(prefix="jaxgran-tests-")
-        config.add_cleanup(partial(shutil.rmtree, os.environ[PROGRAMS], ignore_errors=True))
+        if PROGRAMS not in os.environ:
+            os.environ[PROGRAMS] = tempfile.mkdtemp(prefix="jaxgran-tests-")
+            config.add_cleanup(partial(shutil.rmtree, os.environ[PROGRAMS], ignore_errors=True))
 
 
 @pytest.hookimpl(trylast=True)  # after what measures the coverage of lines has begun
