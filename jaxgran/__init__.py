@@ -33,6 +33,9 @@ from jaxgran.fitting.fit import fit as fit
 from jaxgran.fitting.learnt_law import RestitutionBand as RestitutionBand
 from jaxgran.fitting.learnt_law import restitution_band as restitution_band
 from jaxgran.fitting.likelihood import log_likelihood as log_likelihood
+from jaxgran.fitting.plan import Expected as Expected
+from jaxgran.fitting.plan import Plan as Plan
+from jaxgran.fitting.plan import plan as plan
 from jaxgran.fitting.result import Fit as Fit
 from jaxgran.models.base import AbstractModel as AbstractModel
 from jaxgran.models.base import Limitation as Limitation
@@ -71,7 +74,7 @@ __all__ = ["observables"] + [  # pyright: ignore[reportUnsupportedDunderAll]
     name for name, x in globals().items() if getattr(x, "__module__", "").startswith("jaxgran.")
 ]
 
-_PLOT_FUNCTIONS = ("plot_curve", "plot_fit")
+_PLOT_FUNCTIONS = ("plot_curve", "plot_fit", "plot_plan")
 """Functions of `jaxgran.plotting`, which is imported with matplotlib when one is first used."""
 
 

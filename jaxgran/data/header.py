@@ -103,8 +103,9 @@ def gas_of_header(header: dict[str, str]) -> tuple[Gas, list[str]]:
     Args:
         header: in SI: eta (the packing fraction), diameter (m; the mean one), density (of the
             material, kg/m^3), Y (Pa), nu, T0 (m^2/s^2) and, if it is not 3, dimension; A (s), 0 by
-            default; eps in place of Y, nu and A for a constant restitution; where sizes differ diameter_sd, their standard deviation (m); for rough
-            spheres, walls, drag and a drive also the keys of `elements_of_header`.
+            default; eps in place of Y, nu and A for a constant restitution; where sizes differ
+            diameter_sd, their standard deviation (m); for rough spheres, walls, drag and a drive
+            also the keys of `elements_of_header`.
 
     Returns:
         A gas, and a question for each value that is not usual in a granular

@@ -82,7 +82,7 @@ def _in_file(result: Fit, name: str) -> float | None:
     return None if text == GUESS else float(text)
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
     """Yield rows of columns below their heads, the first one aligned to the left."""
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
     for row in (head, *rows):
@@ -144,7 +144,7 @@ def _parameters(rows: list[dict[str, Any]]) -> Iterator[str]:
                 difference,
             )
         )
-    yield from _table(("", "95 % incl. alternatives", CONDITIONAL, "in file"), cells)
+    yield from table(("", "95 % incl. alternatives", CONDITIONAL, "in file"), cells)
 
 
 def _budget(rows: list[dict[str, Any]], explain: bool) -> Iterator[str]:
@@ -182,4 +182,4 @@ def _alternatives(result: Fit) -> Iterator[str]:
         symbol = symbol_of(result.names[0])
         yield ""
         head = "alternative explanation", "-2 ln L drop", symbol, "95 %", "distinguishable"
-        yield from _table(head, cells)
+        yield from table(head, cells)
