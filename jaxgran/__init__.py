@@ -30,6 +30,8 @@ from jaxgran.data.measurement import read_measurement as read_measurement
 from jaxgran.data.particles import read_particles as read_particles
 from jaxgran.fitting.alternatives import Alternative as Alternative
 from jaxgran.fitting.fit import fit as fit
+from jaxgran.fitting.imitate import Imitation as Imitation
+from jaxgran.fitting.imitate import imitate as imitate
 from jaxgran.fitting.learnt_law import RestitutionBand as RestitutionBand
 from jaxgran.fitting.learnt_law import restitution_band as restitution_band
 from jaxgran.fitting.likelihood import log_likelihood as log_likelihood

@@ -86,6 +86,9 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
     for i, reason in enumerate(chosen):
         print(f"{'' if i else 'chosen':9}- {reason}")
     written = [record] if is_single and not paths else [picture, record]
+    if options.imitate:
+        imitation = jaxgran.imitate(result, options.imitate, key=jax.random.key(options.key))
+        print(f"\n{imitation}")
     print("\nwritten  " + "\n         ".join(map(str, written)) + "\n")
     print(json.dumps(summary, allow_nan=False))
 

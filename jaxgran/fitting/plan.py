@@ -46,10 +46,11 @@ class Expected(NamedTuple):
     Attributes:
         name: of the addition.
         price: what it takes, in words.
-        low, high: ends of the range, SI: medians over the truths that were compared.
-        width: (high - low) over the true value, the median over these truths.
-        smallest, largest: width among the truths; both are `width` where one was compared.
-        gain: width without the addition over that with it.
+        low, high: ends of the range for the given values, SI.
+        width: (high - low) over the true value, for the given values.
+        median, smallest, largest: this width among the truths; all are `width` where the given
+            values alone were compared.
+        gain: width without the addition over that with it, the median over the truths.
 
     >>> planned = jaxgran.plan(measurement, candidates={"as it is": measurement})
     >>> planned.additions[0].name, round(planned.additions[0].gain, 6)
@@ -61,6 +62,7 @@ class Expected(NamedTuple):
     low: float
     high: float
     width: float
+    median: float
     smallest: float
     largest: float
     gain: float = 1.0
@@ -109,28 +111,23 @@ class Plan:
     def __repr__(self) -> str:
         """Table of the ranges, the best addition first."""
         rows = [self.present, *self.additions, *([] if self.pair is None else [self.pair])]
-        longest = max(len(x.price) for x in rows)
-        head = (
-            "",
-            f"{symbol_of(self.parameter)} {self.unit}",
-            "width",
-            "gain",
-            "price".ljust(longest),
-        )
+        long = max(len(x.price) for x in rows)
+        symbol = f"{symbol_of(self.parameter)} {self.unit}".strip()
+        head = ("", symbol, "width", "of the truths", "gain", "price".ljust(long))
         cells = [
-            (x.name, _ends(x), _width(x), f"{x.gain:.2f}", x.price.ljust(longest)) for x in rows
+            (x.name, _ends(x), _percent(x.width), _spread(x), f"{x.gain:.2f}", x.price.ljust(long))
+            for x in rows
         ]
-        return "\n".join(
-            [
-                f"{self.headline}.",
-                "",
-                *table(head, cells),
-                "",
-                "width: of the 95 % range, over the true value; gain: the width as it is over that "
-                "with the addition.",
-                f"In brackets the widths for {len(self.truths)} truths: {', '.join(self.truths)}.",
-            ]
-        )
+        lines = [
+            f"{self.headline}.",
+            "",
+            *table(head, cells),
+            "",
+            "width: of the 95 % range, in per cent of the true value, for the given values; then "
+            f"median (and ends) for {len(self.truths)} truths: {', '.join(self.truths)}.",
+            "gain: the width as it is over that with the addition.",
+        ]
+        return "\n".join(lines)
 
 
 def plan(
@@ -143,10 +140,11 @@ def plan(
 
     A noise-free curve, T(t) by kinetic theory at the times of the measurement with its errors, is
     fitted as `jaxgran.fit` fits a measured one: the range over all alternatives is that to expect.
-    The same is done with each candidate, an addition to the experiment. A plan at a wrong truth
-    misleads: for the experiment as it is and the best three candidates the range is the median over
-    five truths, in which A is smaller and larger, what has a prior departs from it, and the gas
-    contains an effect that the fit does not know. The width is ``(high - low)/(true value)``.
+    The same is done with each candidate, an addition to the experiment. The width of a range is
+    ``(high - low)/(true value)``. A plan at a wrong truth misleads: for the experiment as it is and
+    the best three candidates the width is found for up to five truths, too, in which A is smaller
+    and larger, what has a prior departs from it, and the gas contains an effect that the fit does
+    not know.
 
     Args:
         measurement: a curve with its errors, N and priors. With a curve by `jaxgran.cool`, which
@@ -241,15 +239,16 @@ class _Row:
 
     def expected(self, present: "_Row") -> Expected:
         """Return the range to expect."""
-        low, high = np.median(list(self.ends.values()), axis=0)
+        low, high = self.ends[AS_GIVEN.name]
         widths = [self.width(truth) for truth in self.ends]
         gas = next(iter(present.measurements.values())).gas
         scale = float(np.ravel(gas.value(self.names[0]))[0])
         return Expected(
             self.candidate.name,
             self.candidate.price,
-            float(low) * scale,
-            float(high) * scale,
+            low * scale,
+            high * scale,
+            high - low,
             float(np.median(widths)),
             min(widths),
             max(widths),
@@ -408,15 +407,16 @@ def _ends(x: Expected) -> str:
     return f"{x.low:.3g} .. {high}"
 
 
-def _width(x: Expected) -> str:
-    """Return the width in a cell, with those of the truths."""
-    if not x.width < OPEN_WIDTH:
-        return "open"
-    spread = f" ({_percent(x.smallest)} to {_percent(x.largest)})"
-    return f"{_percent(x.width)}{spread if x.largest > x.smallest else ''} %"
+def _spread(x: Expected) -> str:
+    """Return the widths of the truths in a cell; "" where the given values alone were compared."""
+    if x.smallest == x.largest:
+        return ""
+    return f"{_percent(x.median)} ({_percent(x.smallest)} to {_percent(x.largest)})"
 
 
 def _percent(x: float) -> str:
+    if not x < OPEN_WIDTH:
+        return "open"
     return f"{100 * x:.2g}" if x < 1 else f"{100 * x:.0f}"
 
 

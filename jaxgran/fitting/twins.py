@@ -92,21 +92,49 @@ def truths_of(measurement: Measurement, result: Fit) -> list[Truth]:
         shifts |= {first: sign * PARAMETER_SHIFT} if first in gas.domains else {}
         truths.append(Truth(f"{words} {symbol_of(first)}", shifts))
     rate = RATE_OF_HALVING / halving_time(measurement.curve)
-    widening = [x for x in result.alternatives if x.effect and not x.distinguishable]
-    widening.sort(key=lambda alternative: -alternative.error_reduction_needed)
-    effects = [_with_effect(alternative, gas, rate) for alternative in widening]
+    effects = [_with_effect(x, x.allowed[1] / 2, gas, rate) for x in _widening(result)]
     return truths + [truth for truth in effects if truth is not None][:NUM_EFFECTS]
 
 
-def _with_effect(alternative: Alternative, gas: Gas, rate: float) -> Truth | None:
-    """Return a truth with an effect of some size; None for effects of several parameters.
+def strongest_effect(result: Fit) -> tuple[Truth, dict[str, float]] | None:
+    """Return a gas with the effect that the data prefer, or that widens the range most.
+
+    Args:
+        result: a fit of one curve.
+
+    Returns:
+        The truth, and values of the free parameters with it; None without such an effect.
+    """
+    gas = result.gas
+    rate = RATE_OF_HALVING / halving_time(result.curve)
+    for alternative in result.alternatives:
+        truth = _with_effect(alternative, alternative.amplitude, gas, rate)
+        if alternative.preferred and truth is not None:
+            names = [name for name in result.names if name in gas.domains]
+            values = zip(result.names, alternative.estimate.tolist(), strict=False)
+            return truth, {name: x for name, x in values if name in names}
+    for alternative in _widening(result):
+        truth = _with_effect(alternative, alternative.allowed[1] / 2, gas, rate)
+        if truth is not None:
+            return truth, {}
+    return None
+
+
+def _widening(result: Fit) -> list[Alternative]:
+    """Return the effects that widen the range, the strongest first."""
+    found = [x for x in result.alternatives if x.effect and not x.distinguishable]
+    return sorted(found, key=lambda alternative: -alternative.error_reduction_needed)
+
+
+def _with_effect(alternative: Alternative, amplitude: float, gas: Gas, rate: float) -> Truth | None:
+    """Return a truth with an effect; None for effects of several parameters.
 
     Args:
         alternative: the effect.
+        amplitude: its size.
         gas: the scene.
         rate: its cooling rate at the start, 1/s.
     """
-    amplitude = alternative.allowed[1] / 2
     elements: dict[str, Any] = {}
     if alternative.name == WALLS_ADDED:
         side = side_of_walls(gas, amplitude * rate)
