@@ -439,3 +439,23 @@ def test_plan_prints_a_table_and_writes_it(scene, run):
     assert record["truth"] == 3e-6 and record["additions"][0]["gain"] > 1
     status, _, err = run("plan", "flight.toml", "--out", "plan.png")
     assert status == 2 and "exists. Name another --out" in err
+
+
+@pytest.mark.slow
+def test_reports_are_single_pages(scene, run):
+    (scene / "flight.toml").write_text(SCENE + EXPERIMENT)
+    assert run("plan", "flight.toml", "--report")[0] == 0
+    header = {"eta": 0.05, "diameter": 2e-3, "density": 2500, "Y": 5e7, "nu": 0.22, "T0": 0.01}
+    measured = read_experiment(scene / "flight.toml")
+    curve = dataclasses.replace(measured.curve, status=None)
+    jaxgran.write_curve("flown.csv", curve, header | {"N": 250, "absent": "walls"})
+    options = "--report", "--imitate", 2, "--out", "."
+    status, out, _ = run("fit", "flown.csv", *options)
+    assert status == 0 and "of 2 imitations, its median width is" in out
+    for name, words in (
+        ("flight-plan.html", "Which range of A will this experiment give"),
+        ("flown-kinetic-theory.html", "rough grains without initial rotation"),
+    ):
+        page = (scene / name).read_text()
+        assert words in page and page.count("data:image/png;base64,iVBOR") == 1
+        assert "<script" not in page and str(scene) not in page

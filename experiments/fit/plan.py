@@ -8,7 +8,7 @@ with the one that it puts second, is then simulated by hard spheres, with noise 
 and each run is fitted with the range over all alternatives. Finds for each
 
 - expected: the width that the plan expects, (high - low)/A, for the true values;
-- achieved: the median width of the runs, with its quartiles;
+- achieved: the median width of the runs, with its quartiles; 100 where a range has no upper end;
 - held: runs whose range contains the true A.
 
 The scenes: smooth spheres; walls, whose restitution is known to .03; rough spheres, whose beta_t is
@@ -32,6 +32,7 @@ from experiments.support.plots import GUIDE, INK, caption, panels
 from experiments.support.record import Options, collected, figures, run_parts
 from experiments.support.scenes import cool
 from jaxgran.fitting.candidates import Planned, standard_candidates
+from jaxgran.fitting.plan import OPEN_WIDTH
 
 LAST, ERROR = 0.03, 0.02
 NUM_ADDITIONS = 2
@@ -90,7 +91,7 @@ def compared(scene: Scene, runs: int) -> dict:
         experiment = plan.measurement if change is None else change(plan.measurement)
         found = [fitted(experiment, seed) for seed in range(runs)]
         low, high = np.array(found).T
-        widths = high - low
+        widths = np.minimum(high - low, OPEN_WIDTH)
         quartiles = np.percentile(widths, [25, 50, 75])
         rows.append(
             {

@@ -99,6 +99,7 @@ def plan(
     set: Annotated[tuple[str, ...], common.Several] = (),
     out: Path | None = None,
     overwrite: bool = False,
+    report: bool = False,
     no_cache: bool = False,
 ) -> None:
     """Compute which range of A an experiment will give, and what would narrow it.
@@ -115,13 +116,14 @@ def plan(
         set: Header values KEY=VALUE of a CSV file that replace those of the file.
         out: Picture to write, by default NAME-plan.png; the JSON file has the same name with .json.
         overwrite: Replace existing files.
+        report: Write a web page with the table and the picture, too; needs the extra `report`.
         no_cache: Disable the compilation cache (same as JAXGRAN_NO_CACHE=1).
     """
     if not no_cache:
         common.use_compilation_cache()
     from jaxgran.cli.plan import run_plan
 
-    run_plan(experiment, free=free, given=set, out=out, overwrite=overwrite)
+    run_plan(experiment, free=free, given=set, out=out, overwrite=overwrite, page=report)
 
 
 @APP.command

@@ -10,6 +10,8 @@ from typing import Any
 import jaxgran
 from jaxgran import plotting
 from jaxgran.cli.fit import as_json, parse_settings
+from jaxgran.cli.page import command_of, question_of, sections_of_plan, write_page
+from jaxgran.data.curve import import_extra
 from jaxgran.data.files import check_writable, header_count, name_in_errors, write_atomically
 from jaxgran.data.header import (
     absent_of_header,
@@ -21,7 +23,13 @@ from jaxgran.data.scene_file import errors_of, read_scene_file, times_of
 
 
 def run_plan(
-    path: Path, *, free: Sequence[str], given: Sequence[str], out: Path | None, overwrite: bool
+    path: Path,
+    *,
+    free: Sequence[str],
+    given: Sequence[str],
+    out: Path | None,
+    overwrite: bool,
+    page: bool,
 ) -> None:
     """Plan an experiment, print the table and write a picture and a JSON file.
 
@@ -31,12 +39,16 @@ def run_plan(
         given: KEY=VALUE of the header of a measured curve.
         out: the picture.
         overwrite: whether existing files may be replaced.
+        page: whether a web page is written, too.
     """
+    if page:
+        import_extra("jinja2", "report")  # before the long part
     picture = Path(f"{path.stem}-plan.png") if out is None else out
     record = picture.with_suffix(".json")
     if picture == record:
         raise ValueError(f"--out {out} is the name of the JSON file. Give the picture another one.")
-    for file in (picture, record):
+    written = [picture, record, *([picture.with_suffix(".html")] if page else [])]
+    for file in written:
         if file.exists() and not overwrite:
             raise ValueError(f"{file} exists. Name another --out, or add --overwrite.")
         check_writable(file)
@@ -52,7 +64,13 @@ def run_plan(
     plotting.save_plan(planned, f"{path.stem.replace('_', ' ')}: {planned.headline}", picture)
     text = json.dumps(as_json(details_of(planned)), indent=1, allow_nan=False) + "\n"
     write_atomically(record, lambda file: file.write(text.encode()))
-    print(f"\nwritten  {picture}\n         {record}")
+    if page:
+        sections = sections_of_plan(planned, picture)
+        question = question_of(planned.parameter, "plan")
+        title = path.stem.replace("_", " ")
+        command = command_of("plan", [path])
+        write_page(written[-1], title, question, planned.headline, sections, command)
+    print("\nwritten  " + "\n         ".join(map(str, written)))
 
 
 def read_experiment(path: Path) -> jaxgran.Measurement:

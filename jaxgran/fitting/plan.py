@@ -47,7 +47,8 @@ class Expected(NamedTuple):
         name: of the addition.
         price: what it takes, in words.
         low, high: ends of the range for the given values, SI.
-        width: (high - low) over the true value, for the given values.
+        width: (high - low) over the true value, for the given values; at most 100, where the range
+            has no upper end.
         median, smallest, largest: this width among the truths; all are `width` where the given
             values alone were compared.
         gain: width without the addition over that with it, the median over the truths.
@@ -76,7 +77,8 @@ class Plan:
         parameter: name of the first free parameter.
         truth: its value, SI: that of the fit of the given values.
         present: the range to expect of the experiment as it is.
-        additions: those with an addition, the narrowest one first.
+        additions: those with an addition, the largest gain first: the best three, of different
+            kinds, and then the others, which were compared for the given values alone.
         pair: that with the best two of the best three additions; None if no two go together.
         truths: gases over which medians are taken, in words.
         measurement: the experiment, with the values of kinetic theory.
@@ -108,26 +110,33 @@ class Plan:
         """Unit of the parameter."""
         return unit_of(self.parameter)
 
-    def __repr__(self) -> str:
-        """Table of the ranges, the best addition first."""
+    @property
+    def table(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+        """Head and rows of the table of the ranges, the best addition first."""
         rows = [self.present, *self.additions, *([] if self.pair is None else [self.pair])]
-        long = max(len(x.price) for x in rows)
         symbol = f"{symbol_of(self.parameter)} {self.unit}".strip()
-        head = ("", symbol, "width", "of the truths", "gain", "price".ljust(long))
         cells = [
-            (x.name, _ends(x), _percent(x.width), _spread(x), f"{x.gain:.2f}", x.price.ljust(long))
+            (x.name, _ends(x), _percent(x.width), _spread(x), f"{x.gain:.2f}", x.price)
             for x in rows
         ]
-        lines = [
-            f"{self.headline}.",
-            "",
-            *table(head, cells),
-            "",
+        return ("", symbol, "width", "of the truths", "gain", "price"), cells
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the columns of the table mean."""
+        return (
             "width: of the 95 % range, in per cent of the true value, for the given values; then "
             f"median (and ends) for {len(self.truths)} truths: {', '.join(self.truths)}.",
             "gain: the width as it is over that with the addition.",
-        ]
-        return "\n".join(lines)
+        )
+
+    def __repr__(self) -> str:
+        """Table of the ranges."""
+        head, cells = self.table
+        long = max(len(row[-1]) for row in cells)
+        aligned = [(*row[:-1], row[-1].ljust(long)) for row in (head, *cells)]
+        rows = table(aligned[0], aligned[1:])
+        return "\n".join([f"{self.headline}.", "", *rows, "", *self.notes])
 
 
 def plan(
@@ -190,13 +199,12 @@ def plan(
         for truth in truths[1:]:
             row.add(truth)
     pairs = _compared(_pairs(best), base, present)
-    additions = [row.expected(present) for row in rows]
-    additions.sort(key=lambda addition: -addition.gain)
+    rows.sort(key=lambda row: (len(row.ends) == 1, -row.gain(present)))
     return Plan(
         parameter=names[0],
         truth=float(np.ravel(base.gas.value(names[0]))[0]),
         present=present.expected(present),
-        additions=tuple(additions),
+        additions=tuple(row.expected(present) for row in rows),
         pair=pairs[0].expected(present) if pairs else None,
         truths=tuple(truth.name for truth in truths),
         measurement=base,
@@ -229,15 +237,14 @@ class _Row:
         self.ends[truth.name] = _relative(result, truth, gas)
 
     def width(self, truth: str) -> float:
-        """Return the width of the range for a truth, over the true value."""
+        """Return the width of the range for a truth, over the true value; `OPEN_WIDTH` at most."""
         low, high = self.ends[truth]
-        return high - low
+        return min(high - low, OPEN_WIDTH)
 
     def gain(self, present: "_Row") -> float:
         """Return the width without the addition over that with it, the median over truths."""
         pairs = [(present.width(truth), self.width(truth)) for truth in self.ends]
-        gains = [1.0 if a == b else a / max(b, 1e-300) for a, b in pairs]
-        return float(np.median(gains))
+        return float(np.median([a / max(b, 1e-300) for a, b in pairs]))
 
     def expected(self, present: "_Row") -> Expected:
         """Return the range to expect."""
@@ -250,7 +257,7 @@ class _Row:
             self.candidate.price,
             low * scale,
             high * scale,
-            high - low,
+            self.width(AS_GIVEN.name),
             float(np.median(widths)),
             min(widths),
             max(widths),
