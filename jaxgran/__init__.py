@@ -30,9 +30,14 @@ from jaxgran.data.measurement import read_measurement as read_measurement
 from jaxgran.data.particles import read_particles as read_particles
 from jaxgran.fitting.alternatives import Alternative as Alternative
 from jaxgran.fitting.fit import fit as fit
+from jaxgran.fitting.imitate import Imitation as Imitation
+from jaxgran.fitting.imitate import imitate as imitate
 from jaxgran.fitting.learnt_law import RestitutionBand as RestitutionBand
 from jaxgran.fitting.learnt_law import restitution_band as restitution_band
 from jaxgran.fitting.likelihood import log_likelihood as log_likelihood
+from jaxgran.fitting.plan import Expected as Expected
+from jaxgran.fitting.plan import Plan as Plan
+from jaxgran.fitting.plan import plan as plan
 from jaxgran.fitting.result import Fit as Fit
 from jaxgran.models.base import AbstractModel as AbstractModel
 from jaxgran.models.base import Limitation as Limitation
@@ -71,7 +76,7 @@ __all__ = ["observables"] + [  # pyright: ignore[reportUnsupportedDunderAll]
     name for name, x in globals().items() if getattr(x, "__module__", "").startswith("jaxgran.")
 ]
 
-_PLOT_FUNCTIONS = ("plot_curve", "plot_fit")
+_PLOT_FUNCTIONS = ("plot_curve", "plot_fit", "plot_plan")
 """Functions of `jaxgran.plotting`, which is imported with matplotlib when one is first used."""
 
 

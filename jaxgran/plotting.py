@@ -1,6 +1,7 @@
 """Plots of curves and fits; needs matplotlib (the extras `notebook` and `experiments`).
 
-`jaxgran.plot_curve` and `jaxgran.plot_fit` import this module when they are first used.
+`jaxgran.plot_curve`, `jaxgran.plot_fit` and `jaxgran.plot_plan` import this module when they are
+first used.
 """
 
 import textwrap
@@ -12,7 +13,9 @@ import numpy as np
 
 from jaxgran.data.curve import CoolingCurve, above_noise, import_extra
 from jaxgran.data.files import write_atomically
+from jaxgran.fitting.plan import OPEN_WIDTH, Plan
 from jaxgran.fitting.result import Fit
+from jaxgran.scene.parameters import symbol_of
 
 import_extra("matplotlib")
 from matplotlib.axes import Axes  # noqa: E402
@@ -164,6 +167,51 @@ def save_curves(curves: dict[str, tuple[CoolingCurve, CoolingCurve | None]], tit
         if computed is not None:
             plot_curve(computed, axes, color=shade)
     axes.legend(frameon=False, loc="lower left")
+    _save(figure, title, path)
+
+
+def plot_plan(plan: Plan, axes: Axes | None = None) -> Axes:
+    """Plot the range to expect of an experiment as it is and with each addition, the best on top.
+
+    Args:
+        plan: of `jaxgran.plan`.
+        axes: matplotlib axes; by default the current axes of pyplot.
+
+    Returns:
+        The axes.
+    """
+    if axes is None:
+        from matplotlib import pyplot
+
+        axes = pyplot.gca()
+    rows = [*([] if plan.pair is None else [plan.pair]), *plan.additions, plan.present]
+    highest = max([x.high for x in rows if x.width < OPEN_WIDTH], default=plan.truth)
+    end = 1.1 * max(highest, plan.truth)
+    for place, row in enumerate(rows):
+        colour = INK if row is plan.present else COLOURS["kinetic theory"]
+        high = min(row.high, end)
+        axes.plot([row.low, high], [place, place], "-", lw=5, color=colour, solid_capstyle="butt")
+        if high < row.high:
+            axes.plot([high], [place], ">", color=colour, clip_on=False)
+    axes.axvline(plan.truth, color=COLOURS["guide"], lw=1.2)
+    axes.set_yticks(range(len(rows)), [row.name for row in rows])
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+    axes.set_xlim(0, end)
+    unit = f" ({plan.unit})" if plan.unit else ""
+    axes.set_xlabel(f"95 % range of {symbol_of(plan.parameter)} to expect{unit}")
+    return axes
+
+
+def save_plan(plan: Plan, title: str, path: str | Path) -> None:
+    """Write the picture of a plan, `plot_plan`.
+
+    Args:
+        plan: of `jaxgran.plan`.
+        title: above the picture.
+        path: of the file; its suffix is the format, PNG without one.
+    """
+    figure = Figure(figsize=(8.0, 1.8 + 0.3 * len(plan.additions)), layout="constrained")
+    plot_plan(plan, figure.subplots())
     _save(figure, title, path)
 
 

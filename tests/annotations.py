@@ -12,6 +12,7 @@ UNCHECKED = {
     "fitting.fit": {"fit"},
     "fitting.learnt_law": {"restitution_band"},
     "fitting.likelihood": {"log_likelihood"},
+    "fitting.plan": {"plan"},
     "models.choose": {"choose_model"},
     "models.cool": {"cool"},
     "models.spheres": {"AbstractSpheres.sized_for"},

@@ -17,6 +17,7 @@ import pytest
 
 import jaxgran
 from jaxgran.cli.main import main
+from jaxgran.cli.plan import read_experiment
 from jaxgran.data.header import gas_of_header
 from tests.beads import glass_beads
 
@@ -391,3 +392,77 @@ def test_the_second_run_of_a_command_compiles_nothing(scene):
     assert not run("--no-cache")
     first = run()
     assert first and run() == first
+
+
+EXPERIMENT = """
+[experiment]
+times = {number = 10, first = 0.1, last = 10.0}
+T_err = 0.02
+N = 250
+absent = ["walls", "drag"]
+"""
+
+
+def test_an_experiment_is_read_from_a_scene(scene):
+    (scene / "flight.toml").write_text(SCENE + "eta_err = 0.002\n" + EXPERIMENT)
+    measurement = read_experiment(scene / "flight.toml")
+    assert measurement.num_particles == 250 and measurement.absent == ("walls", "drag")
+    assert np.allclose(measurement.curve.times, np.geomspace(0.1, 10.0, 10))
+    relative = measurement.curve.temperature_error / measurement.curve.temperature
+    assert np.allclose(relative, 0.02) and measurement.errors_measured
+    assert [*measurement.priors] == ["packing_fraction"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("T_err = 0.02", "T_err = 3.0", "T_err must lie in (0, 1), got 3. It is relative"),
+        ("T_err = 0.02", "T_err = 0.0", "T_err must lie in (0, 1), got 0"),
+        ("number = 10", "number = 1", "number of times must be"),
+        ("last = 10.0", "last = 0.05", "last must lie after first"),
+        (", last = 10.0", "", "give times = [0.1, 0.3, 1.0] or times = {number"),
+        ("times = {number = 10, first = 0.1, last = 10.0}", "", "[experiment] has no times"),
+        ("N = 250", "N = 250\nT_eror = 1", "[experiment] T_eror is not known: give some of times"),
+        ("N = 250", "N = 2.5", "N"),
+        ("N = 250", "", "a plan needs N"),
+        ("T_err = 0.02", "T_rot_err = 0.02", "T_rot_err needs rough grains: give beta_t"),
+        ("[experiment]", "[flight]", "[flight] is not read"),
+    ],
+)
+def test_what_makes_no_experiment_is_refused(scene, run, old, new, message):
+    assert old in EXPERIMENT
+    (scene / "flight.toml").write_text(SCENE + EXPERIMENT.replace(old, new))
+    status, _, err = run("plan", "flight.toml")
+    assert status == 2 and message in err, err
+
+
+@pytest.mark.slow
+def test_plan_prints_a_table_and_writes_it(scene, run):
+    (scene / "flight.toml").write_text(SCENE + EXPERIMENT)
+    status, out, _ = run("plan", "flight.toml", "--out", "plan.png")
+    assert status == 0 and "no roughness: declared" in out
+    assert (scene / "plan.png").read_bytes()[:8] == PNG
+    record = json.loads((scene / "plan.json").read_text())
+    assert record["truth"] == 3e-6 and record["additions"][0]["gain"] > 1
+    status, _, err = run("plan", "flight.toml", "--out", "plan.png")
+    assert status == 2 and "exists. Name another --out" in err
+
+
+@pytest.mark.slow
+def test_reports_are_single_pages(scene, run):
+    (scene / "flight.toml").write_text(SCENE + EXPERIMENT)
+    assert run("plan", "flight.toml", "--report")[0] == 0
+    header = {"eta": 0.05, "diameter": 2e-3, "density": 2500, "Y": 5e7, "nu": 0.22, "T0": 0.01}
+    measured = read_experiment(scene / "flight.toml")
+    curve = dataclasses.replace(measured.curve, status=None)
+    jaxgran.write_curve("flown.csv", curve, header | {"N": 250, "absent": "walls"})
+    options = "--report", "--imitate", 2, "--out", "."
+    status, out, _ = run("fit", "flown.csv", *options)
+    assert status == 0 and "of 2 imitations, its median width is" in out
+    for name, words in (
+        ("flight-plan.html", "Which range of A will this experiment give"),
+        ("flown-kinetic-theory.html", "rough grains without initial rotation"),
+    ):
+        page = (scene / name).read_text()
+        assert words in page and page.count("data:image/png;base64,iVBOR") == 1
+        assert "<script" not in page and str(scene) not in page

@@ -33,8 +33,8 @@ def names():
 
 # Each compiles a fit of several curves, all alternatives, or a run of spheres.
 LONG = (
-    *("Choice", "DSMC", "SteadyState", "explain_status", "impact"),
-    *("observables", "read_particles", "sweep"),
+    *("Choice", "DSMC", "Expected", "Imitation", "Plan", "SteadyState", "explain_status", "impact"),
+    *("imitate", "observables", "plan", "read_particles", "sweep"),
 )
 NAMES = [pytest.param(x, marks=pytest.mark.slow) if x in LONG else x for x in jaxgran.__all__]
 

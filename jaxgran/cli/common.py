@@ -71,6 +71,10 @@ class FitOptions:
         absent: Effects that are known to be absent (walls, roughness, drag, friction), in addition
             to those of the header line `# absent: walls`.
         quick: Leave out the search of alternative explanations, which takes most of the time.
+        imitate: Number of simulated runs of the fitted scene that are fitted, too, to count how
+            often the range holds the true value; 0 for none.
+        report: Write a web page with the result, its picture and tables, too; needs the extra
+            `report`.
         explain: Print the error budget as a table that explains each part.
         no_cache: Disable the compilation cache (same as JAXGRAN_NO_CACHE=1).
     """
@@ -88,6 +92,8 @@ class FitOptions:
     overwrite: bool = False
     absent: Annotated[tuple[str, ...], Several] = ()
     quick: bool = False
+    imitate: WholeNumber = 0
+    report: bool = False
     explain: bool = False
     no_cache: bool = False
 

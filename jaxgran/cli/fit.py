@@ -20,6 +20,8 @@ import numpy as np
 import jaxgran
 from jaxgran import plotting
 from jaxgran.cli.common import FitOptions, models_by_name
+from jaxgran.cli.page import command_of, question_of, sections_of_fit, write_page
+from jaxgran.data.curve import import_extra
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.files import name_in_errors
 from jaxgran.data.header import OPTIONAL_KEYS, PRIOR_KEYS, absent_of_header
@@ -51,6 +53,8 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
             f"--model {options.model}: drop tests and several measurements are fitted with "
             f"{JOINT_MODEL}. Fit the curves one by one with other models."
         )
+    if options.report:
+        import_extra("jinja2", "report")  # before the long part
     picture, record = output_files(files[0].stem, options)
     measurements = read_all(paths, options)
     request = parameters_of(options, measurements)
@@ -86,6 +90,16 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
     for i, reason in enumerate(chosen):
         print(f"{'' if i else 'chosen':9}- {reason}")
     written = [record] if is_single and not paths else [picture, record]
+    if options.report:
+        page = record.with_suffix(".html")
+        sections = sections_of_fit(result, picture if picture in written else None)
+        question = question_of(result.names[0], "fit")
+        title = ", ".join(path.stem.replace("_", " ") for path in files)
+        write_page(page, title, question, result.headline, sections, command_of("fit", files))
+        written.append(page)
+    if options.imitate:
+        imitation = jaxgran.imitate(result, options.imitate, key=jax.random.key(options.key))
+        print(f"\n{imitation}")
     print("\nwritten  " + "\n         ".join(map(str, written)) + "\n")
     print(json.dumps(summary, allow_nan=False))
 
@@ -260,7 +274,8 @@ def output_files(name: str, options: FitOptions) -> tuple[Path, Path]:
     if not existing.is_dir() or not os.access(existing, os.W_OK):
         raise ValueError(f"{existing} is not a writable folder. Name another one with --out.")
     files = folder / f"{stem}.png", folder / f"{stem}.json"
-    for file in files:
+    pages = [folder / f"{stem}.html"] if options.report else []
+    for file in (*files, *pages):
         if file.exists() and not options.overwrite:
             raise ValueError(f"{file} exists. Name another --out, or add --overwrite.")
     return files

@@ -1,13 +1,13 @@
-"""The command line: `jaxgran fit`, `jaxgran cool` and `jaxgran choose`."""
+"""The command line: `jaxgran fit`, `jaxgran plan`, `jaxgran cool` and `jaxgran choose`."""
 
 import os
 import sys
 import time
-import tomllib
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ import jaxgran
 from jaxgran.cli import common
 from jaxgran.data.files import check_writable, header_count, name_in_errors
 from jaxgran.data.header import gas_of_header
-from jaxgran.data.tables import header_in_si, read_text
+from jaxgran.data.scene_file import read_scene_file
 from jaxgran.models.choose import NUM_PARTICLES, default_models
 
 NUM_POINTS = 50
@@ -26,7 +26,7 @@ NUM_POINTS = 50
 
 APP = App(
     name="jaxgran",
-    help="Cooling granular gases: fit a measured curve, compute one, choose a model.",
+    help="Cooling granular gases: fit a measured curve, plan one, compute one, choose a model.",
     default_parameter=Parameter(negative=()),
     suppress_keyboard_interrupt=False,
 )
@@ -88,6 +88,42 @@ def fit(*curves: Path, options: common.FitOptions | None = None) -> None:
     if not (*curves, *options.drop_test):
         raise ValueError("no curve is given. Name a file: jaxgran fit CURVE.csv.")
     run_fit(curves, options, started)
+
+
+@APP.command
+def plan(
+    experiment: Path,
+    /,
+    *,
+    free: Annotated[tuple[common.FreeParameter, ...], common.Several] = (),
+    set: Annotated[tuple[str, ...], common.Several] = (),
+    out: Path | None = None,
+    overwrite: bool = False,
+    report: bool = False,
+    no_cache: bool = False,
+) -> None:
+    """Compute which range of A an experiment will give, and what would narrow it.
+
+    Prints a table; writes a picture and a JSON file.
+
+    Args:
+        experiment: TOML file of a scene (see `jaxgran cool`; errors such as eta_err are priors)
+            with a table [experiment]: times (s; a list, or {number, first, last}), T_err (relative,
+            .02 is 2 %) and, where planned, T_rot_err and msd_err, N, replicas, absent. Or the CSV
+            file of a measured curve: the plan starts at its fit.
+        free: Parameters to fit, the first of which is planned for; by default A, and T0 if T has
+            no errors.
+        set: Header values KEY=VALUE of a CSV file that replace those of the file.
+        out: Picture to write, by default NAME-plan.png; the JSON file has the same name with .json.
+        overwrite: Replace existing files.
+        report: Write a web page with the table and the picture, too; needs the extra `report`.
+        no_cache: Disable the compilation cache (same as JAXGRAN_NO_CACHE=1).
+    """
+    if not no_cache:
+        common.use_compilation_cache()
+    from jaxgran.cli.plan import run_plan
+
+    run_plan(experiment, free=free, given=set, out=out, overwrite=overwrite, page=report)
 
 
 @APP.command
@@ -185,20 +221,7 @@ def _read_scene(path: Path, until: float | None, fits_A: bool = False) -> Simple
     times = None
     if path.suffix == ".toml":
         with name_in_errors(path):
-            try:
-                values = tomllib.loads(read_text(path, "eta, diameter, ..."))
-            except tomllib.TOMLDecodeError as error:
-                raise ValueError(f"not TOML ({error}). Write lines such as eta = 0.05.") from None
-            if tables := [key for key, value in values.items() if isinstance(value, dict)]:
-                raise ValueError(
-                    f"[{tables[0]}] is not read: write all keys without tables, as container_side "
-                    "and wall_restitution for walls"
-                )
-            texts = {
-                key: " x ".join(map(str, value)) if isinstance(value, list) else str(value)
-                for key, value in values.items()
-            }
-            header = header_in_si(texts)
+            header, _ = read_scene_file(path)
             gas, questions = gas_of_header(header)
         for question in questions:
             warnings.warn(f"{path}: {question}", stacklevel=2)

@@ -63,9 +63,12 @@ class DropTest(eqx.Module):
                 f"{advice}"
             )
 
-    def residuals(self, gas: Gas) -> Float[Array, "n"]:
-        """Return (measured - computed eps) over the error, for spheres of a gas."""
+    def computed(self, gas: Gas) -> Float[Array, "n"]:
+        """Return eps of each impact, for spheres of a gas."""
         reduced = gas.law.on_wall if self.onto_plate else gas.law.reduced
         law = reduced(diameter=gas.diameter, mass=gas.mass, speed=jnp.ones(()))
-        computed = law.restitution(jnp.asarray(self.speed))
-        return (jnp.asarray(self.restitution) - computed) / jnp.asarray(self.error)
+        return law.restitution(jnp.asarray(self.speed))
+
+    def residuals(self, gas: Gas) -> Float[Array, "n"]:
+        """Return (measured - computed eps) over the error, for spheres of a gas."""
+        return (jnp.asarray(self.restitution) - self.computed(gas)) / jnp.asarray(self.error)

@@ -10,8 +10,12 @@
 - `error_budget`: errors that depend on the fitted gas: of the clock, few particles, derivatives.
 - `alternatives`: alternative explanations of a curve, and the range of the parameters over them.
 - `diagnosis`: interpretation of a fit in words, and `log_likelihood` for samplers.
+- `plan`, `candidates`, `twins`: the range to expect of an experiment, additions to it, and curves
+  by theory for what may be true.
+- `imitate`: runs of a fitted scene by particles, each of them fitted.
 
 This package may import all packages below it and `jaxgran.models`. It knows models by the interface
-of `jaxgran.AbstractModel` only, except `KineticTheory`, the default model. `jaxgran`,
-`jaxgran.plotting`, `jaxgran.cli` and experiments import it. It re-exports nothing.
+of `jaxgran.AbstractModel` only, except `KineticTheory`, the default model, and the particle models
+that `imitate` runs. `jaxgran`, `jaxgran.plotting`, `jaxgran.cli` and experiments import it. It
+re-exports nothing.
 """

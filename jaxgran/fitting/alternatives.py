@@ -24,6 +24,7 @@ from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.rows import CurveRows
 from jaxgran.fitting.search import Minimum, minimise, newton_step
 from jaxgran.models.error_model import ROUGHNESS_ERROR, SLIDING_ERROR
+from jaxgran.scene.gas import Gas
 from jaxgran.scene.laws import VARIANT_SPEED, VISCOELASTIC_EXPONENT
 
 ALLOWED = 3.84
@@ -113,6 +114,12 @@ DECLARABLE = {
 }
 """Parameter of each of the effects `jaxgran.data.header.ABSENT`, and what describes it in a
 file."""
+
+
+WALLS_ADDED = "walls that dissipate energy"
+DRAG_ADDED = "linear drag, as in air"
+ROUGHNESS_ADDED = "rough grains without initial rotation"
+"""Names of alternatives that add one element to the scene."""
 
 
 class Kind(NamedTuple):
@@ -376,24 +383,20 @@ def _kinds(problem: Problem, flat: np.ndarray, absent: tuple[str, ...]) -> list[
     }
 
     def walls(share: float, label: str) -> dict[str, float]:
-        gas = scenes[label]
-        flux = 2 * np.sqrt(float(gas.temperature) / (2 * np.pi))
-        side = 2 * (1 - WALL_RESTITUTION**2) * flux / max(share * rates[label], 1e-300)
-        side = side + float(gas.diameter)
-        side = max(side, MIN_WALL_SIDE * float(gas.diameter))
+        side = side_of_walls(scenes[label], share * rates[label])
         return {"wall_side": side, "wall_coefficient": WALL_RESTITUTION}
 
     beta_t = "tangential_restitution"
     possible = [
         Kind(
-            "walls that dissipate energy",
+            WALLS_ADDED,
             ("wall_side",),
             (SHARES,),
             walls,
             lambda share: WALL_RATE_ERROR * share,
         ),
         Kind(
-            "linear drag, as in air",
+            DRAG_ADDED,
             ("drag_rate",),
             (DRAG_SHARES,),
             lambda share, label: {"drag_rate": share * rates[label] / 2},
@@ -403,7 +406,7 @@ def _kinds(problem: Problem, flat: np.ndarray, absent: tuple[str, ...]) -> list[
         ),
         Kind("independent errors of T", (WHITE,), (WHITE_ERRORS,), lambda x, label: {WHITE: x}),
         Kind(
-            "rough grains without initial rotation",
+            ROUGHNESS_ADDED,
             (beta_t,),
             (ROUGHNESS,),
             lambda x, label: {beta_t: x - 1},
@@ -463,6 +466,18 @@ def _kinds(problem: Problem, flat: np.ndarray, absent: tuple[str, ...]) -> list[
         for kind in possible
         if known.isdisjoint(kind.parameters) and supported.issuperset(kind.parameters)
     ]
+
+
+def side_of_walls(gas: Gas, rate: float) -> float:
+    """Return the side of a box whose walls, of restitution `WALL_RESTITUTION`, cool a gas.
+
+    Args:
+        gas: the gas.
+        rate: cooling rate by the walls at the start, 1/s.
+    """
+    flux = 2 * np.sqrt(float(gas.temperature) / (2 * np.pi))
+    side = 2 * (1 - WALL_RESTITUTION**2) * flux / max(rate, 1e-300) + float(gas.diameter)
+    return max(side, MIN_WALL_SIDE * float(gas.diameter))
 
 
 def _initial_rate(m: CurveRows, values: dict[str, Any], curve: dict[str, Any]) -> float:

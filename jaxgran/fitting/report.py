@@ -82,7 +82,7 @@ def _in_file(result: Fit, name: str) -> float | None:
     return None if text == GUESS else float(text)
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
     """Yield rows of columns below their heads, the first one aligned to the left."""
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
     for row in (head, *rows):
@@ -144,7 +144,7 @@ def _parameters(rows: list[dict[str, Any]]) -> Iterator[str]:
                 difference,
             )
         )
-    yield from _table(("", "95 % incl. alternatives", CONDITIONAL, "in file"), cells)
+    yield from table(("", "95 % incl. alternatives", CONDITIONAL, "in file"), cells)
 
 
 def _budget(rows: list[dict[str, Any]], explain: bool) -> Iterator[str]:
@@ -168,8 +168,8 @@ def _budget(rows: list[dict[str, Any]], explain: bool) -> Iterator[str]:
             yield f"  {share:8.2g}  {name}: {meaning}"
 
 
-def _alternatives(result: Fit) -> Iterator[str]:
-    """Yield the table of the alternatives, with the values of the first parameter."""
+def alternative_rows(result: Fit) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Return the head and the rows of the table of the alternatives."""
     cells = []
     for x in result.alternatives:
         needed = f"no (needs {x.error_reduction_needed:.2g}x smaller errors)"
@@ -178,8 +178,13 @@ def _alternatives(result: Fit) -> Iterator[str]:
         if x.restitution is not None:
             limits = f"none: eps = {x.restitution:.3g}"
         cells.append((x.name, f"{x.improvement:.2g}", f"{x.estimate[0]:.3g}", limits, answer))
+    symbol = symbol_of(result.names[0])
+    return ("alternative explanation", "-2 ln L drop", symbol, "95 %", "distinguishable"), cells
+
+
+def _alternatives(result: Fit) -> Iterator[str]:
+    """Yield the table of the alternatives, with the values of the first parameter."""
+    head, cells = alternative_rows(result)
     if cells:
-        symbol = symbol_of(result.names[0])
         yield ""
-        head = "alternative explanation", "-2 ln L drop", symbol, "95 %", "distinguishable"
-        yield from _table(head, cells)
+        yield from table(head, cells)

@@ -50,6 +50,13 @@ def is_right_where_walls_are_told(found):
     assert rows["nothing"]["held"] == 0 and rows["nothing"]["A"] > 1.5
 
 
+def expects_the_widths_of_runs(found):
+    (scene,) = (scene for scene in found["scenes"] if scene["name"] == "smooth")
+    present, best, _ = scene["rows"]
+    assert best["expected"] < 0.5 * present["expected"]
+    assert best["achieved"] < 0.5 * present["achieved"]
+
+
 def is_the_same_twice(found):
     assert found["sweep"]["vmap_error"] < 1e-6 and found["sweep"]["scipy_error"] < 1e-6
 
@@ -120,6 +127,7 @@ SCRIPTS = {
     "fit/sample_posterior": ("--samples 300 --warmup 150", is_the_budgets, "png"),
     "fit/drop_tower": ("--runs 1", holds_A, "png"),
     "fit/wrong_physics": ("--runs 3 --rows 'walls, eps'", is_right_where_walls_are_told, ""),
+    "fit/plan": ("--runs 3 --rows smooth", expects_the_widths_of_runs, "png"),
     "fit/fit_head_to_head": ("--smoke --only fit_head_to_head", finds_A, ""),
     "speed/benchmark_theory": ("--smoke --only benchmark_kinetic_theory", is_the_same_twice, ""),
     "speed/benchmark_particles": ("--smoke --only particles", cools, ""),

@@ -12,11 +12,13 @@ from tests.experiments.scripts import run
 TEXT = (EXPERIMENTS / "recipes.md").read_text(encoding="utf-8")
 RECIPES = dict(re.findall(r"^## (.*?)\n.*?```python\n(.*?)```", TEXT, re.DOTALL | re.MULTILINE))
 WRITTEN = {
+    "Before you measure: what would narrow the range of A": "plan.png",
     "A sweep and its heat map": "sweep.png",
     "Snapshots, observables and a film": "film.gif",
     "Saving and loading everything": "run.npz",
 }
 SAID = {
+    "Before you measure: what would narrow the range of A": "no rotation + ten drops",
     "Your own data: speeds in ms and mm": "Kinetic theory is consistent with this curve",
     "Your own law of restitution": "0.972",
     "Saving and loading everything": "two replicas (2, 100, 3) True",

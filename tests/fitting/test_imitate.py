@@ -1,0 +1,110 @@
+"""Imitations of a measurement: their noise, their counts, and what they refuse."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxgran
+from jaxgran.fitting import imitate as module
+from tests.beads import glass_beads
+
+TIMES = np.geomspace(0.1, 10.0, 10)
+GAS = glass_beads()
+RUNS = 300
+
+
+def planned(**options) -> jaxgran.Measurement:
+    T = jaxgran.cool(GAS, TIMES).temperature
+    curve = jaxgran.CoolingCurve(TIMES, T, temperature_error=0.02 * T)
+    return jaxgran.Measurement(GAS, curve, **{"num_particles": 64} | options)
+
+
+def counted(low, high, estimate, error, **fields) -> jaxgran.Imitation:
+    ends = (np.asarray(x, float) for x in (low, high, estimate, error))
+    grades = ("determined",) * len(low)
+    first = ("as given", "dissipative_constant", 1.0, "DSMC")
+    return jaxgran.Imitation(*first, fields.pop("asked", len(low)), *ends, grades, **fields)
+
+
+def test_ranges_that_hold_the_truth_are_counted():
+    low = [0.5, 1.1, np.nan, 0.9]
+    high = [1.5, 1.3, np.nan, 1.1]
+    found = counted(low, high, [1.1, 1.2, 3.0, 1.0], [0.1] * 4)
+    assert (found.runs, found.held, found.held_alone) == (4, 2, 2)
+    assert found.width == pytest.approx(0.2)
+    assert found.headline.startswith("the range held the true A in 2 of 4 imitations")
+    assert "after 1 of 9 runs" in repr(counted([0], [2], [1], [1], asked=9))
+
+
+def test_imitations_have_the_errors_of_the_measurement():
+    T = np.broadcast_to(planned().curve.temperature, (2 * RUNS, TIMES.size))
+    runs = jaxgran.CoolingCurve(TIMES, T[0], replicas=jaxgran.CoolingCurve(TIMES, jnp.asarray(T)))
+    exact = jaxgran.cool(GAS, TIMES)
+    result = FakeFit(exact)
+    mean = planned(replicas=2, errors_measured=True)
+    for measurement, error, number in ((planned(), 0.02, 2 * RUNS), (mean, 0.02, RUNS)):
+        each = module._measured(measurement, result, runs, number, jax.random.key(0))
+        assert len(each) == number
+        ratio = np.array([m.curve.temperature for m in each]) / T[0]
+        assert np.std(ratio) == pytest.approx(error, rel=0.1)
+        relative = each[0].curve.temperature_error / T[0]
+        assert np.allclose(relative, 0.02)
+    noiseless = module._measured(planned(replicas=2), result, runs, RUNS, jax.random.key(0))
+    assert np.allclose(noiseless[0].curve.temperature, T[0])
+
+
+class FakeFit(jaxgran.Fit):
+    """A fit of which the curve alone is known."""
+
+    def __init__(self, curve):
+        object.__setattr__(self, "curve", curve)
+
+
+@pytest.mark.parametrize(
+    ("measurements", "message"),
+    [
+        ({"": planned(num_particles=None)}, "imitate needs N, the number of grains"),
+        ({"": planned(num_particles=10**6)}, "5e.06 are allowed: ask for 5 runs or fewer"),
+        ({"a": planned(), "b": planned()}, "imitate takes a fit of one curve"),
+    ],
+)
+def test_what_cannot_be_imitated_is_refused(measurements, message):
+    result = FakeFit(jaxgran.cool(GAS, TIMES))
+    object.__setattr__(result, "measurements", measurements)
+    with pytest.raises(ValueError, match=message):
+        jaxgran.imitate(result, 100)
+
+
+@pytest.mark.slow
+def test_interrupted_imitations_give_what_they_have(monkeypatch):
+    measurement = planned(absent=("walls", "roughness", "drag"))
+    result = jaxgran.fit(measurement)
+    fits = []
+
+    def interrupted(*arguments, **options):
+        if len(fits) == 3:
+            raise KeyboardInterrupt
+        fits.append(jaxgran.fit(*arguments, **options))
+        return fits[-1]
+
+    monkeypatch.setattr(module, "fit", interrupted)
+    found = jaxgran.imitate(result, 5, progress=False)
+    assert (found.runs, found.asked, found.strongest) == (3, 5, None)
+    assert found.width == pytest.approx(np.median((found.high - found.low) / found.value), rel=1e-2)
+    assert "interrupted" in repr(found)
+
+
+@pytest.mark.slow
+def test_the_strongest_alternative_is_imitated():
+    rough = dataclasses.replace(GAS, surface=jaxgran.Rough(-0.8))
+    T = jaxgran.cool(rough, TIMES).temperature
+    curve = jaxgran.CoolingCurve(TIMES, T, temperature_error=0.01 * T)
+    absent = ("walls", "drag")
+    measurement = jaxgran.Measurement(GAS, curve, 200, absent=absent, errors_measured=True)
+    found = jaxgran.imitate(jaxgran.fit(measurement), 4, model=jaxgran.DSMC(200), progress=False)
+    other = found.strongest
+    assert other is not None and other.truth == "with roughness"
+    assert other.held > other.held_alone

@@ -1,0 +1,164 @@
+"""Plans of experiments: twins, truths, additions, and the range to expect."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import jaxgran
+from jaxgran.fitting import candidates
+from jaxgran.fitting.twins import Truth, twin
+from tests.beads import glass_beads
+
+TIMES = np.geomspace(0.1, 10.0, 10)
+GAS = glass_beads()
+
+
+def planned(gas=GAS, times=TIMES, error=0.02, **options) -> jaxgran.Measurement:
+    """A planned curve of 250 grains, with errors of T."""
+    curve = jaxgran.cool(gas, times)
+    curve = dataclasses.replace(
+        curve,
+        temperature_error=error * curve.temperature,
+        rotational_temperature=None,
+        displacement=None,
+    )
+    options = {"num_particles": 250, "errors_measured": True} | options
+    return jaxgran.Measurement(gas, curve, **options)
+
+
+SMOOTH = planned()
+BOXED = planned(
+    dataclasses.replace(GAS, container=jaxgran.Walls(0.05, restitution=0.9)),
+    priors={"wall_coefficient": (0.9, 0.05)},
+)
+ROUGH = planned(
+    dataclasses.replace(GAS, surface=jaxgran.Rough(-0.3)),
+    priors={"tangential_restitution": (-0.3, 0.2)},
+)
+
+
+def names_of(measurement) -> list[str]:
+    return [candidate.name for candidate in candidates.standard_candidates(measurement)]
+
+
+def test_additions_that_do_not_apply_are_left_out():
+    common = ["N x 4", "a second density", "20 normal impacts", "half the errors", "duration x 10"]
+    for measurement in (SMOOTH, BOXED, ROUGH):
+        assert {*common} <= {*names_of(measurement)}
+    of_walls = {"container x 2", "eps_w known to +-0.02"}
+    of_roughness = {"T_rot measured", "beta_t known to +-0.05", "no friction: declared"}
+    absences = {"no walls: declared", "no roughness: declared", "no drag: declared"}
+    special = of_walls | of_roughness | absences
+    assert special & {*names_of(SMOOTH)} == absences
+    assert special & {*names_of(BOXED)} == of_walls | absences - {"no walls: declared"}
+    assert special & {*names_of(ROUGH)} == of_roughness | absences - {"no roughness: declared"}
+    declared = dataclasses.replace(SMOOTH, absent=("drag", "walls"))
+    assert special & {*names_of(declared)} == {"no roughness: declared"}
+    bare = jaxgran.Measurement(GAS, jaxgran.CoolingCurve(TIMES, SMOOTH.curve.temperature))
+    assert not {"half the errors", "twice the points", "N x 4"} & {*names_of(bare)}
+
+
+def test_additions_change_what_they_say():
+    longer = candidates.with_duration(SMOOTH, 4.0)
+    assert np.allclose(longer.curve.times, np.geomspace(0.1, 40.0, 10))
+    error = candidates.with_more_points(SMOOTH).curve.temperature_error
+    assert np.allclose(error, SMOOTH.curve.temperature_error / 2**0.5)
+    boxed = candidates.in_larger_box(BOXED)
+    assert boxed.num_particles == 2000 and np.isclose(boxed.gas.value("wall_side"), 0.1)
+    known = candidates.with_prior(ROUGH, "tangential_restitution", 0.1).priors
+    assert float(known["tangential_restitution"][1]) == 0.1
+    dense = candidates.with_second_density(SMOOTH)["second density"]
+    assert np.isclose(dense.gas.packing_fraction, 0.15)
+    assert np.allclose(dense.curve.times, TIMES / 3)
+    thin = candidates.with_second_density(
+        planned(glass_beads(packing_fraction=0.12), priors={"packing_fraction": (0.12, 0.006)})
+    )["second density"]
+    assert np.isclose(thin.priors["packing_fraction"][1], 0.002)
+
+
+def test_additions_are_combined_in_both_orders():
+    both = candidates.combined(candidates.with_impacts, candidates.with_errors, SMOOTH)
+    reverse = candidates.combined(candidates.with_errors, candidates.with_impacts, SMOOTH)
+    for found in (both, reverse):
+        assert isinstance(found, dict) and [*found] == ["curve", "impacts"]
+        error = found["curve"].curve.temperature_error
+        assert np.allclose(error, SMOOTH.curve.temperature_error / 2)
+    three = candidates.combined(candidates.with_impacts, candidates.with_second_density, SMOOTH)
+    assert isinstance(three, dict) and {*three} == {"curve", "impacts", "second density"}
+    assert candidates.combined(candidates.in_larger_box, candidates.with_errors, SMOOTH) is None
+
+
+@pytest.mark.slow
+def test_twin_is_the_curve_of_the_truth_with_the_relative_errors():
+    truth = Truth(
+        "rough and larger", {"diameter": np.log(2.0)}, "", {"surface": jaxgran.Rough(0.0)}
+    )
+    gas = dataclasses.replace(
+        GAS.replace(diameter=2 * GAS.diameter, mass=8 * GAS.mass), surface=jaxgran.Rough(0.0)
+    )
+    many = dataclasses.replace(SMOOTH, num_particles=10**7)
+    found = twin(many, truth).curve
+    exact = jaxgran.cool(gas, TIMES, model=jaxgran.KineticTheory(spin_cumulants=True))
+    assert np.allclose(found.temperature, exact.temperature, rtol=1e-4)
+    assert np.allclose(found.temperature_error, 0.02 * found.temperature)
+    few = twin(dataclasses.replace(SMOOTH, num_particles=20)).curve
+    assert np.all(few.temperature < twin(many).curve.temperature)
+    drops = candidates.with_impacts(SMOOTH)["impacts"]
+    test = twin(drops).data
+    assert isinstance(test, jaxgran.DropTest) and np.allclose(test.residuals(GAS), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("measurement", "options", "message"),
+    [
+        (SMOOTH.curve, {}, "expected a jaxgran.Measurement, got a CoolingCurve"),
+        (candidates.with_impacts(SMOOTH)["impacts"], {}, "begins with a cooling curve"),
+        (dataclasses.replace(SMOOTH, num_particles=None), {}, "needs N, the number of grains"),
+        (planned(error=3.0), {}, "errors of T are 100 % or more"),
+        (SMOOTH, {"candidates": [SMOOTH]}, "candidates must be a dictionary"),
+        (SMOOTH, {"candidates": {}}, "candidates must be a dictionary"),
+        (SMOOTH, {"candidates": {"mine": 3}}, "candidates must be a dictionary"),
+    ],
+)
+def test_what_makes_no_experiment_is_refused(measurement, options, message):
+    with pytest.raises(ValueError, match=message):
+        jaxgran.plan(measurement, **options)
+
+
+@pytest.mark.slow
+def test_plan_is_the_fit_of_noise_free_curves():
+    def as_it_is(m):
+        return m
+
+    found = jaxgran.plan(
+        SMOOTH,
+        candidates={
+            "the same": as_it_is,
+            "no walls, drag, roughness": dataclasses.replace(
+                SMOOTH, absent=("walls", "drag", "roughness")
+            ),
+            "not here": lambda m: None,
+        },
+    )
+    best, same = found.additions
+    assert best.gain > 2 and same.gain == pytest.approx(1.0)
+    assert best.low <= found.truth <= best.high
+    assert best.width == pytest.approx((best.high - best.low) / found.truth)
+    assert found.present.smallest < found.present.median < found.present.largest
+    assert found.pair is None and len(found.truths) == 5
+    assert "no walls, drag, roughness" in repr(found).splitlines()[0]
+    axes = jaxgran.plot_plan(found)
+    assert len(axes.get_yticklabels()) == 3
+
+
+@pytest.mark.slow
+def test_refused_candidates_are_named():
+    driven = dataclasses.replace(GAS, surface=jaxgran.Frictional(0.5, friction=0.2))
+    mine = jaxgran.Measurement(driven, SMOOTH.curve, num_particles=250)
+    with pytest.raises(ValueError, match="candidate 'mine': .*friction"):
+        jaxgran.plan(SMOOTH, candidates={"mine": mine})
+    with pytest.raises(ValueError, match="the measurement: .*gamma"):
+        jaxgran.plan(SMOOTH, free=("gamma",))
+    with pytest.raises(ValueError, match="'mine' must give a jaxgran.Measurement"):
+        jaxgran.plan(SMOOTH, candidates={"mine": lambda m: 3})
