@@ -62,21 +62,25 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
 
 
 MAX_DISTANCE = 3.0
-"""Factor between measured and fitted T from which on, if all values differ by it, the scale of T or
-of time is wrong."""
+"""Factor between measured and fitted T from which on, if `DISTANT_SHARE` of the values differ by it,
+the scale of T or of time is wrong."""
+
+DISTANT_SHARE = 0.8
+"""Share of such values: where T has fallen most, a curve in another unit may come near."""
 
 
 def distant_curves(problem: Problem, found: Evaluation) -> list[str]:
     """Return the labels of curves that no fit and no alternative comes near.
 
-    All alternatives begin at the same T_0: values that are all far off are in another unit, and the
+    All alternatives begin at the same T_0: values that are far off are in another unit, and the
     search for an alternative would not end.
     """
     labels = []
     for m in problem.curves:
         T = m.values[:, 0][m.used[:, 0] > 0]
         computed = found.curves[m.label]["temperature"][m.used[:, 0] > 0]
-        if np.all(np.abs(np.log(np.maximum(T, TINY) / computed)) > np.log(MAX_DISTANCE)):
+        distances = np.abs(np.log(np.maximum(T, TINY) / computed))
+        if np.mean(distances > np.log(MAX_DISTANCE)) >= DISTANT_SHARE:
             labels.append(m.label)
     return labels
 

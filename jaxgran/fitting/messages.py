@@ -95,7 +95,7 @@ MESSAGES = {
     "{factor:.2g} times smaller",
     "outliers": "far outliers at {places}: check them and their error bars",
     "without outliers": "; without them {symbol} is {value:.3g} +- {error:.2g}",
-    "distant": "every T differs from the fitted one by more than a factor of {ratio:g}: "
+    "distant": "nearly every T differs from the fitted one by more than a factor of {ratio:g}: "
     "alternatives were not compared; check the units, the scale of T and T0",
     "max_steps": "the search did not converge: increase max_steps or free fewer parameters",
     "simulations": "{number} simulations were run; their noise is at most {share:.0f} % of the "
