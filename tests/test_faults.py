@@ -198,18 +198,18 @@ def test_files_keep_permissions_and_follow_links(tmp_path):
 
 # --- derivatives of values that are nan ----------------------------------------------------------
 
-NAN_MODELS = [
-    jaxgran.KineticTheory(),
-    pytest.param(jaxgran.DSMC(20, replicas=2), marks=pytest.mark.slow),
-    pytest.param(jaxgran.HardSpheres(20).sized_for(GAS), marks=pytest.mark.slow),
-    pytest.param(jaxgran.SoftSpheres(20).sized_for(GAS), marks=pytest.mark.slow),
+DENSE = ("packing_fraction", 0.8)
+HEATING = ("dissipative_constant", -1e-6)
+NAN_CASES = [
+    (jaxgran.KineticTheory(), *DENSE),
+    (jaxgran.KineticTheory(), *HEATING),
+    pytest.param(jaxgran.DSMC(20, replicas=2), *HEATING, marks=pytest.mark.slow),
+    pytest.param(jaxgran.HardSpheres(20).sized_for(GAS), *DENSE, marks=pytest.mark.slow),
+    pytest.param(jaxgran.SoftSpheres(20).sized_for(GAS), *HEATING, marks=pytest.mark.slow),
 ]
 
 
-@pytest.mark.parametrize("model", NAN_MODELS, ids=lambda model: type(model).__name__)
-@pytest.mark.parametrize(
-    "name, value", [("packing_fraction", 0.8), ("dissipative_constant", -1e-6)]
-)
+@pytest.mark.parametrize("model, name, value", NAN_CASES)
 def test_derivatives_are_nan_where_values_are(model, name, value):
     def temperature(x):
         return cool(GAS.replace(**{name: x}), model=model, throw=False).temperature[0]
