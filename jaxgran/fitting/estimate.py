@@ -62,8 +62,8 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
 
 
 MAX_DISTANCE = 3.0
-"""Factor between measured and fitted T from which on, if `DISTANT_SHARE` of the values differ by it,
-the scale of T or of time is wrong."""
+"""Factor between measured and fitted T. If `DISTANT_SHARE` of the values differ by more, the scale
+of T or of time is wrong."""
 
 DISTANT_SHARE = 0.8
 """Share of such values: where T has fallen most, a curve in another unit may come near."""
