@@ -157,7 +157,7 @@ def test_a_fit_of_several_measurements_is_not_drawn():
 
 
 def test_plot_functions_are_imported_on_first_use():
-    assert set(dir(jaxgran)) == {*jaxgran.__all__, "plot_curve", "plot_fit"}
+    assert set(dir(jaxgran)) == {*jaxgran.__all__, "plot_curve", "plot_fit", "plot_plan"}
     with pytest.raises(AttributeError, match="no attribute 'plot_nothing'"):
         _ = jaxgran.plot_nothing
 
