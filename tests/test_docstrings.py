@@ -34,7 +34,7 @@ def names():
 # Each compiles a fit of several curves, all alternatives, or a run of spheres.
 LONG = (
     *("Choice", "DSMC", "Expected", "Imitation", "Plan", "SteadyState", "explain_status", "impact"),
-    *("imitate", "observables", "plan", "read_particles", "sweep"),
+    *("imitate", "log_likelihood", "observables", "plan", "read_particles", "sweep"),
 )
 NAMES = [pytest.param(x, marks=pytest.mark.slow) if x in LONG else x for x in jaxgran.__all__]
 

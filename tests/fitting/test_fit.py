@@ -127,6 +127,7 @@ def test_errors_that_are_the_scatter_of_N_grains_are_left_out():
     assert results[2].standard_error[0] > results[0].standard_error[0]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:this curve does not determine")
 def test_a_search_through_gases_too_soft_for_the_theory_ends():
     gas, curve = cooled_beads()

@@ -156,7 +156,7 @@ def test_plan_is_the_fit_of_noise_free_curves():
 def test_refused_candidates_are_named():
     driven = dataclasses.replace(GAS, surface=jaxgran.Frictional(0.5, friction=0.2))
     mine = jaxgran.Measurement(driven, SMOOTH.curve, num_particles=250)
-    with pytest.raises(ValueError, match="candidate 'mine': .*friction"):
+    with pytest.raises(ValueError, match="candidate 'mine': .*Frictional"):
         jaxgran.plan(SMOOTH, candidates={"mine": mine})
     with pytest.raises(ValueError, match="the measurement: .*gamma"):
         jaxgran.plan(SMOOTH, free=("gamma",))

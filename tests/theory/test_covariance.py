@@ -244,7 +244,9 @@ def test_walls_take_regularly():
 # --- limits -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", GASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=pytest.mark.slow) if x == "all" else x for x in GASES]
+)
 def test_is_positive_symmetric_and_zero_at_the_start(name):
     gas = GASES[name]
     times = taus(gas, 0.0, 1e-3, 0.1, 0.2, 1, 2, 5, 10, 11, 12, 100, 1e3)
@@ -289,6 +291,7 @@ def test_the_variance_goes_as_one_over_n():
     np.testing.assert_allclose(one / 250, many, rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_few_times_give_what_many_give():
     gas = GASES["all"]
     few, many = taus(gas, 2.0, 50.0), taus(gas, *np.sort(np.r_[np.geomspace(0.01, 49, 300), 2, 50]))
@@ -312,6 +315,7 @@ def test_elements_without_effect_change_nothing():
 # --- as a part of compiled programs -------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["smooth", "all"])
 def test_derivatives_agree(name):
     gas = GASES[name]
@@ -351,6 +355,7 @@ def test_a_batch_is_computed_in_one_program():
         np.testing.assert_allclose(found, alone, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_single_precision():
     gas, double = GASES["rough"], GASES["rough"]
     times = taus(gas, 1, 10, 100)

@@ -144,6 +144,7 @@ def test_rates_are_even_in_the_spread():
     np.testing.assert_allclose((T[2] - T[0]) / (T[1] - T[0]), 4, rtol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [glass_beads, lambda: glass_beads(dimension=2)])
 def test_derivatives_in_the_spread_agree(make):
     gas = of_sizes(make(), 0.1)
@@ -171,7 +172,8 @@ def test_drag_alone_slows_small_spheres_more():
     np.testing.assert_allclose(curve.size_ratio, parts[0] / parts[1], rtol=1e-5)
 
 
-@pytest.mark.parametrize("energy", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("energy", [False, True])
 def test_the_filter_is_the_covariance(energy):
     gas = of_sizes(glass_beads(), 0.15)
     times = taus(gas, *np.concatenate([[0.0], np.geomspace(0.05, 50, 60)]))
