@@ -18,7 +18,7 @@ WRITTEN = {
     "Saving and loading everything": "run.npz",
 }
 SAID = {
-    "Before you measure: what would narrow the range of A": "no rotation + ten drops",
+    "Before you measure: what would narrow the range of A": "ten drops + no rotation",
     "Your own data: speeds in ms and mm": "Kinetic theory is consistent with this curve",
     "Your own law of restitution": "0.972",
     "Saving and loading everything": "two replicas (2, 100, 3) True",
