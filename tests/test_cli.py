@@ -449,6 +449,7 @@ def test_plan_prints_a_table_and_writes_it(scene, run):
 
 
 @pytest.mark.slow
+@pytest.mark.minutes
 def test_reports_are_single_pages(scene, run):
     (scene / "flight.toml").write_text(SCENE + EXPERIMENT)
     assert run("plan", "flight.toml", "--report")[0] == 0

@@ -143,6 +143,7 @@ SCRIPTS = {
 
 
 @pytest.mark.slow
+@pytest.mark.minutes
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_small_run_of_a_script(script, tmp_path):
     arguments, check, picture = SCRIPTS[script]
@@ -155,6 +156,7 @@ def test_small_run_of_a_script(script, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.minutes
 def test_clustering_leaves_haffs_law(tmp_path):
     parts = "paper_clustering", "clustering_film"
     options = "--only", *parts, "--smoke", "--out", "here"

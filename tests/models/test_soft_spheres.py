@@ -58,6 +58,7 @@ def test_a_fast_sphere_outruns_no_list():
 
 
 @pytest.mark.slow
+@pytest.mark.minutes
 def test_a_step_too_large_is_shortened():
     gas = soft_beads(0.001, 0.1, packing_fraction=0.1)
     cold = lattice(gas, 64)

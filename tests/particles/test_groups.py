@@ -41,6 +41,7 @@ def test_large_replicas_on_one_device_run_in_turn(kind):
 
 
 @pytest.mark.slow  # two devices need a process of their own, which compiles for each
+@pytest.mark.minutes
 def test_two_devices():
     tests = Path(__file__).with_name("on_two_devices.py")
     command = [sys.executable, "-m", "pytest", "-n0", "-p", "no:cacheprovider", str(tests)]

@@ -93,6 +93,7 @@ def test_a_fault_of_any_run_is_one_of_the_derivative():
 
 
 @pytest.mark.slow
+@pytest.mark.minutes
 def test_soft_spheres_have_the_difference_of_two_runs():
     gas = soft_beads(0.05, 0.3, packing_fraction=0.15)
     times = jnp.array([0.5, 1.0]) * gas.mean_free_time  # before rounding has grown

@@ -101,6 +101,7 @@ def test_the_tangent_is_exact_between_projections():
 
 
 @pytest.mark.slow
+@pytest.mark.minutes
 def test_touching_two_and_three_bodies_have_finite_slopes():
     gas = soft_beads(0.02, 0.2, packing_fraction=0.02)
     scene = SoftSpheres(3).scene(gas)
