@@ -216,7 +216,7 @@ def _read_scene(path: Path, until: float | None, fits_A: bool = False) -> Simple
     Args:
         path: of a TOML file or a curve.
         until: the last time, s.
-        fits_A: whether A is that of a fit where a curve has none.
+        fits_A: whether A is fitted where a curve has none.
     """
     times = None
     if path.suffix == ".toml":
@@ -236,7 +236,7 @@ def _read_scene(path: Path, until: float | None, fits_A: bool = False) -> Simple
                 fitted = jaxgran.fit(measurement, quick=True)
             gas = fitted.gas
             header["A"] = repr(float(gas.value("dissipative_constant")))
-            print(f"A = {float(header['A']):.4g} s is that of a fit of this curve")
+            print(f"A = {float(header['A']):.4g} s, by a fit of this curve")
     if not {"A", "eps"} & header.keys():
         raise ValueError(
             f"{path} does not give A, in s, or eps, a constant restitution. Add one, or estimate A "

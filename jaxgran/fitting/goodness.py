@@ -17,8 +17,8 @@ def goodness(problem: Problem, found: Evaluation) -> dict[str, Any]:
     """Return chi^2, its degrees of freedom, and its probabilities by chance.
 
     T and T_rot, <dr^2> and each drop test are tested separately, so that many points of one do not
-    hide a misfit of the other: the p-value is that of the worst, corrected for the choice. Where N
-    is not known, its scatter explains any curve: then it is tested that N is not too small.
+    hide a misfit of the other: the p-value is the smallest of theirs, corrected for the choice.
+    Where N is not known, its scatter explains any curve: then it is tested that N is not too small.
     """
     chi2 = sum(float(np.sum(row.values**2)) for row in found.rows)
     counts = {id(row): _count(problem, row) for row in found.rows}

@@ -116,28 +116,26 @@ def log_ratio(values: Array, log_computed: Array, errors: Array) -> Array:
     return jnp.where(share < 1, share * log + (1 - share) * (ratio - 1), log)
 
 
-def log_density_change(values: Any, log_computed: Any, errors: Any) -> Any:
+def log_density_change(values: Array, log_computed: Array, errors: Array) -> Array:
     """Return what -2 ln L gains as `log_ratio` is not everywhere ln of the measured value.
 
     It is ``-2 ln(y df/dy)`` for the residual f of a value y, 0 where f is ln y: the density of y is
     that of f times df/dy. Where y is below its error, the error replaces the first y, which no
-    parameter changes. Arrays are of JAX or of NumPy.
+    parameter changes.
     """
-    xp = jnp if isinstance(log_computed, jax.Array) else np
-    ratio = values / xp.exp(log_computed)
+    ratio = values / jnp.exp(log_computed)
     share = _share_of_log(log_computed, errors)
-    slope = share / xp.maximum(ratio, LOG_RATIO_FROM) + 1 - share
-    unit = xp.where(values > errors, values, errors)
+    slope = share / jnp.maximum(ratio, LOG_RATIO_FROM) + 1 - share
+    unit = jnp.where(values > errors, values, errors)
     near_zero = share < 1
-    change = -2 * (xp.log(xp.where(near_zero, unit * slope, 1.0)) - log_computed)
-    return xp.where(near_zero, change, 0.0)
+    change = -2 * (jnp.log(jnp.where(near_zero, unit * slope, 1.0)) - log_computed)
+    return jnp.where(near_zero, change, 0.0)
 
 
-def _share_of_log(log_computed: Any, errors: Any) -> Any:
+def _share_of_log(log_computed: Array, errors: Array) -> Array:
     """Return 1 where logarithms are compared, 0 where values are."""
-    xp = jnp if isinstance(log_computed, jax.Array) else np
-    distance = xp.exp(log_computed) / xp.where(errors > 0, errors, xp.finfo(errors.dtype).tiny)
-    share = xp.clip((distance - LINEAR_TO) / (LOG_FROM - LINEAR_TO), 0.0, 1.0)
+    distance = jnp.exp(log_computed) / jnp.where(errors > 0, errors, jnp.finfo(errors.dtype).tiny)
+    share = jnp.clip((distance - LINEAR_TO) / (LOG_FROM - LINEAR_TO), 0.0, 1.0)
     return share**2 * (3 - 2 * share)
 
 
@@ -148,8 +146,11 @@ def innovations(
     sensitivity: Float[Array, "nodes gases"],
     observed: Observed,
     noise: Noise,
-) -> tuple[Float[Array, "nodes 2 gases"], Float[Array, "nodes 2 gases"]]:
-    """Return the innovations of a measured curve about some gases, and their variances.
+) -> tuple[
+    Float[Array, "nodes 2 gases"], Float[Array, "nodes 2 gases"], Float[Array, "nodes 2 gases"]
+]:
+    """Return the innovations of a measured curve about some gases, their variances, and what
+    -2 ln L gains where T is compared in place of ln T (`log_density_change`).
 
     Args:
         gas: neighbouring scenes: its floats have an axis (gases,).
@@ -167,7 +168,7 @@ def innovations(
     found, spread = filtered(
         gas, nodes, residuals[:, :, None], variances, sensitivity, observed.used, noise
     )
-    return found[:, :, 0], spread
+    return found[:, :, 0], spread, log_density_change(values, log_computed, errors)
 
 
 def filtered(

@@ -164,7 +164,7 @@ def plan(
         candidates: additions by name, in place of the standard ones: each is a measurement, several
             by label, or a function that takes the planned measurement and returns such. All but
             the measured values counts.
-        free: free parameters, as those of `jaxgran.fit`. The range is that of the first one.
+        free: free parameters, see `jaxgran.fit`. The plan gives the range of the first one.
 
     Returns:
         `Plan`. `print` shows a table, `jaxgran.plot_plan` a picture.
@@ -188,7 +188,7 @@ def plan(
     central = _fit(DATA, {"": base}, free)
     names = central.names
     if names[0] not in base.gas.domains:
-        raise ValueError(f"the plan is that of a parameter of the gas, got free = {names}")
+        raise ValueError(f"a plan needs a parameter of the gas first in free, got {names}")
     truths = truths_of(base, central)
     present = _Row(Candidate("as it is", "", _unchanged, ""), {"": base}, names)
     present.ends[AS_GIVEN.name] = _relative(central, AS_GIVEN, base.gas)

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from jaxgran._utils.tracing import fast_compilation
 from jaxgran.data.measurement import START_TIME
-from jaxgran.fitting.likelihood import Nodes, filtered, innovations, log_density_change
+from jaxgran.fitting.likelihood import Nodes, filtered, innovations
 from jaxgran.fitting.parameters import as_floats, power_of_line, with_floats
 from jaxgran.fitting.rows import (
     CALIBRATION,
@@ -187,8 +187,7 @@ class PredictedCurve:
         return [tangent for element, tangent in pairs if element.name != DISPLACEMENT]
 
     def _around(self, sources: dict[str, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return innovations and variances at the unknowns and at two neighbours in each of them,
-        and what -2 ln L gains where T is compared in place of ln T (`log_density_change`).
+        """Return the results of `innovations` at the unknowns and at two neighbours of each.
 
         The shapes are (1 + 2 unknowns, 2 times): those of T are followed by those of T_rot. The
         factor of <dr^2> is left out.
@@ -223,12 +222,9 @@ class PredictedCurve:
         compiled = _compiled(innovations, jax.default_backend())
         found = compiled(gas, nodes, compared, T / (T + floor), observed, noise)
         # Values of T are followed by those of T_rot.
-        changes = log_density_change(
-            observed.values[..., None], compared, observed.errors[..., None]
-        )
         values, variances, changes = (
             np.asarray(x)[self.place, :, :count].transpose(2, 1, 0).reshape(count, -1)
-            for x in (*found, changes)
+            for x in found
         )
         used = self.rows.used.T.ravel()
         return values, np.where(used > 0, variances, 1.0), np.where(used > 0, changes, 0.0)

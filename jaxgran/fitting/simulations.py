@@ -222,7 +222,7 @@ class Simulations:
         for s in near:
             difference = self.measured - s.values
             # The noise of a run's slope goes with that of its values, which would move the
-            # estimate: the slope is that of the other runs.
+            # estimate: the slope comes from the other runs.
             slope = s.slope
             if len(near) > 1:
                 slope = slopes + (slopes - s.slope) / (len(near) - 1)

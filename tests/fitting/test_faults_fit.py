@@ -57,8 +57,9 @@ def test_the_density_of_a_value_is_normalised():
     for computed in (0.1, 1.0, 4.0, 6.0, 8.0, 20.0):
         log_computed = jnp.full(values.shape, np.log(computed))
         errors = jnp.full(values.shape, error)
-        residuals = log_ratio(jnp.asarray(values), log_computed, errors)
-        change = log_density_change(values, log_computed, errors)
+        measured = jnp.asarray(values)
+        residuals = log_ratio(measured, log_computed, errors)
+        change = log_density_change(measured, log_computed, errors)
         # The density of the residual times its slope; the unit is that of `log_density_change`.
         unit = np.where(values > error, values, error) if computed < 10 else values
         density = np.exp(-0.5 * (residuals * computed / error) ** 2 - 0.5 * change)
