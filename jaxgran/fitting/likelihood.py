@@ -283,12 +283,11 @@ def _steps(
     rates = jax.vmap(run_process, in_axes=(0, -1), out_axes=-1)
     jacobian, spread, starts = rates(gas, jax.tree.map(_middle, means))
     collisions = _change(nodes.collisions)
-    size = len(jacobian) + 2
-    of_run = slice(0, size - 2)
-    rate_error, sample = size - 2, size - 1
+    rate_error = len(jacobian)
+    size = rate_error + 1
     drift = jnp.zeros((size, size, *nodes.rotation.shape), jacobian.dtype)
-    noises = drift.at[of_run, of_run].set(noise.scatter * spread * collisions)
-    drift = drift.at[of_run, of_run].set(jacobian * collisions)
+    noises = drift.at[:rate_error, :rate_error].set(noise.scatter * spread * collisions)
+    drift = drift.at[:rate_error, :rate_error].set(jacobian * collisions)
     # An error of the rate moves all temperatures along their mean course.
     error = _middle(noise.rate_error)[:, None]
     of_T = _change(nodes.log_temperature)
@@ -301,9 +300,6 @@ def _steps(
     memory = jnp.abs(of_T) / RATE_ERROR_LENGTH
     drift = drift.at[rate_error, rate_error].set(-memory)
     noises = noises.at[rate_error, rate_error].set(2 * memory)
-    forgotten = SAMPLE_MEMORY * collisions
-    drift = drift.at[sample, sample].set(-forgotten)
-    noises = noises.at[sample, sample].set(2 * forgotten * noise.sample)
     flat = size, size, -1
     needed: Any = NUM_DOUBLINGS
     if not differentiable:
@@ -311,7 +307,15 @@ def _steps(
         longest = jnp.max(jnp.abs(drift))
         needed = jnp.clip(jnp.ceil(jnp.log2(64 * longest)), 1, NUM_DOUBLINGS).astype(int)
     found = propagators(drift.reshape(flat), noises.reshape(flat), needed)
-    changes, increments = (jnp.moveaxis(x.reshape(drift.shape), 2, 0) for x in found)
+    # The sampling error is independent of all others.
+    forgotten = jnp.expm1(-SAMPLE_MEMORY * collisions)
+    sampled = -noise.sample * jnp.expm1(-2 * SAMPLE_MEMORY * collisions)
+    changes, increments = (
+        jnp.moveaxis(jnp.pad(x.reshape(drift.shape), [(0, 1), (0, 1), (0, 0), (0, 0)]), 2, 0)
+        for x in found
+    )
+    changes = changes.at[:, size, size].set(forgotten)
+    increments = increments.at[:, size, size].set(sampled)
     turning = nodes.rotation > 0
     of_rotation = (nodes.rotation + ROTATION_OFFSET) / jnp.where(turning, nodes.rotation, jnp.inf)
     return noise.scatter * starts[:, :, 0], changes, increments, of_rotation

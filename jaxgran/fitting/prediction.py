@@ -192,22 +192,26 @@ class PredictedCurve:
         The shapes are (1 + 2 unknowns, 2 times): those of T are followed by those of T_rot. The
         factor of <dr^2> is left out.
         """
-        around = [self.prediction]
-        for tangent in self._moving():
-            for step in (DIFFERENCE, -DIFFERENCE):
-                around.append(
-                    jax.tree.map(lambda x, dx, h=step: x + h * dx, self.prediction, tangent)
-                )
-        count = len(around)
-        around += [self.prediction] * (_batch_size(count) - count)
-        batch: Prediction = jax.tree.map(lambda *x: np.stack(x, axis=-1), *around)
+        moving = self._moving()
+        count = 1 + 2 * len(moving)
+        # Columns: the unknowns themselves, each with a step up and a step down, and padding.
+        steps = np.zeros((len(moving), _batch_size(count)))
+        for k in range(len(moving)):
+            steps[k, 1 + 2 * k] = DIFFERENCE
+            steps[k, 2 + 2 * k] = -DIFFERENCE
+
+        def around(x: Any, *along: Any) -> np.ndarray:
+            slopes = np.stack([np.zeros_like(x), *along], axis=-1)[..., 1:]
+            return np.asarray(x)[..., None] + slopes @ steps
+
+        batch: Prediction = jax.tree.map(around, self.prediction, *moving)
         noise = self._noise(batch.scatter, sources)
         observed = self._observed(sources)
         floor = float(self.values.get(FLOOR, 0.0))
         T = np.exp(batch.compared[:, 0])
         compared = batch.compared.copy()
         compared[:, 0] = np.log(T + floor)
-        gases = len(around)
+        gases = steps.shape[1]
         gas = jax.tree.map(lambda x: np.broadcast_to(x, (gases, *np.shape(x))), self.gas)
         gas = with_floats(gas, {name: np.moveaxis(x, -1, 0) for name, x in batch.floats.items()})
         nodes = Nodes(
@@ -323,7 +327,8 @@ def predicted_curve(
         elements: the unknowns of this measurement.
         tolerance: factor of the model's tolerance.
     """
-    floats = as_floats({name: x for name, x in values.items() if name in rows.gas.domains})
+    names = values.keys() & rows.gas.domains.keys()
+    floats = as_floats({name: values[name] for name in names})
     gas = with_floats(rows.gas, floats)
     elapsed = np.asarray(rows.curve.times) - float(values.get(START_TIME, 0.0))
     elapsed = elapsed * rows.faster

@@ -19,7 +19,7 @@ from jaxgran.fitting.parameters import (
     prior_residuals,
     residuals_and_slopes,
 )
-from jaxgran.fitting.prediction import Element, Residuals, predicted_curve
+from jaxgran.fitting.prediction import Element, PredictedCurve, Residuals, predicted_curve
 from jaxgran.fitting.rows import CurveRows, DropRows
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import Gas
@@ -71,6 +71,9 @@ class Problem:
     fixed: dict[str, dict[str, Any]] = field(default_factory=dict)
     tolerance: float = 1.0
     _last: dict[bytes, Evaluation] = field(init=False, default_factory=dict, compare=False)
+    _curves: dict[str, tuple[bytes, PredictedCurve]] = field(
+        init=False, default_factory=dict, compare=False
+    )
 
     @classmethod
     def build(
@@ -219,8 +222,7 @@ class Problem:
                 add("drop test", m.label, row / widening, slopes, is_prior=False)
                 rows[-1] = rows[-1]._replace(log_variance=2 * np.log(widening))
                 continue
-            applied = [e for e in elements if e.label in (None, m.label)]
-            curve = predicted_curve(m, self._simplified_model, own, applied, self.tolerance)
+            curve = self._curve(m, flat, own, elements)
             rows += curve.residuals(len(elements), **sources)
             curves[m.label] = curve.fields
             for name, error in m.nuisances.items():
@@ -232,6 +234,17 @@ class Problem:
             for name, (row, slopes) in prior_residuals(priors, gas, values[at]).items():
                 add(name, label or None, row, slopes)
         return summed(rows, curves)
+
+    def _curve(
+        self, m: CurveRows, flat: np.ndarray, values: dict[str, Any], elements: list[Element]
+    ) -> PredictedCurve:
+        """Return a computed curve: it is computed once for all factors of the variances."""
+        known, curve = self._curves.get(m.label, (b"", None))
+        if curve is None or known != flat.tobytes():
+            applied = [e for e in elements if e.label in (None, m.label)]
+            curve = predicted_curve(m, self._simplified_model, values, applied, self.tolerance)
+            self._curves[m.label] = flat.tobytes(), curve
+        return curve
 
 
 def _of_unit_variance(

@@ -447,10 +447,9 @@ def times_with_nodes(times: np.ndarray, mean_free_time: float) -> tuple[np.ndarr
     since_first = np.log1p((times[order] - times[order[0]]) / mean_free_time)
     lengths = np.append(known[1], np.diff(since_first))
     parts = np.maximum(np.ceil(lengths / MAX_LOG_STEP).astype(int), 1)
-    steps = zip(known, known[1:], parts, strict=False)
-    merged = np.concatenate([[0.0], *(np.linspace(a, b, n + 1)[1:] for a, b, n in steps)])
     at = np.cumsum(parts)
-    merged = np.expm1(merged) * mean_free_time
+    logs = np.interp(np.arange(at[-1] + 1), np.append(0, at), known)
+    merged = np.expm1(logs) * mean_free_time
     merged[at] = times[order]
     place = np.empty(times.size, int)
     place[order] = at

@@ -125,7 +125,7 @@ def _directions(gas: Gas, sizes: dict[str, int]) -> tuple[Gas, np.ndarray]:
     number is one of 4, 8, 16, ..., so that few programs are compiled.
     """
     count = max(4, 1 << sum(sizes.values()).bit_length())
-    along = jax.tree.map(lambda x: np.zeros((count, *np.shape(x)), jnp.asarray(x).dtype), gas)
+    along = jax.tree.map(lambda x: np.zeros((count, *x.shape), x.dtype), gas)
     fields = gas._float_fields
     begin = 1
     for name, size in sizes.items():

@@ -6,6 +6,7 @@
   and rates are per collision.
 """
 
+from functools import cached_property
 from math import gamma, pi
 from typing import Any, NamedTuple
 
@@ -259,7 +260,7 @@ class Gas(eqx.Module):
             lambda module: [fields[name].get(module) for name in values], self, arrays
         )
 
-    @property
+    @cached_property
     def _float_fields(self) -> dict[str, FloatField]:
         gas_domains = domains_of("Gas") | {"packing_fraction": _PACKING_DOMAINS[self.dimension]}
         if self.diameter_sd is None:

@@ -291,18 +291,24 @@ def process(
     exp_y = spins.rotation + ROTATION_OFFSET
     step_of_A = 2 * STEP * (1 + spins.rotation / inertia)
 
-    def at_point(steps: Float[Array, "4"]) -> tuple[Array, Array]:
-        """Rates of the temperatures, and second moments of the energies by each kind of impact."""
-        of_T, of_y, of_S, of_A = steps
+    def impacts_of(of_T: Float[Array, ""]) -> tuple[Array, Impacts]:
+        """Speed sqrt(T/T_0), and each kind of impact."""
         speed = jnp.exp((mean.log_temperature + STEP * of_T) / 2)
-        shifted = exp_y * jnp.exp(STEP * of_y)
-        rotation = shifted - ROTATION_OFFSET
         kinds = [collisions(scene, density, speed, mean, d)]
         if scene.walls is not None:
             kinds.append(wall_impacts(scene.walls, surface, speed, d))
+        return speed, jax.tree.map(lambda *x: jnp.stack(x), *kinds)
+
+    def at_point(
+        steps: Float[Array, "4"], speed: Float[Array, ""], impacts: Impacts
+    ) -> tuple[Array, Array]:
+        """Rates of the temperatures, and second moments of the energies by each kind of impact."""
+        _, of_y, of_S, of_A = steps
+        shifted = exp_y * jnp.exp(STEP * of_y)
+        rotation = shifted - ROTATION_OFFSET
         S, A = 2 + 2 * STEP * of_S, 2 * rotation / inertia + step_of_A * of_A
         each_kind = jax.vmap(lambda impacts: energy_moments(impacts, surface, S, A, d))
-        gains, squares = each_kind(jax.tree.map(lambda *x: jnp.stack(x), *kinds))
+        gains, squares = each_kind(impacts)
         gains = jnp.sum(gains, 0)
         heating = 2 / d * gains[0]
         if drag is not None:
@@ -317,7 +323,12 @@ def process(
         return jnp.stack([heating, turning / shifted]), squares
 
     points = STENCIL[: 3 if surface is None else 11 if cumulants else 5]
-    rates, squares = jax.vmap(at_point)(jnp.asarray(points, mean.sonine.dtype))
+    # Impacts depend on ln T alone, which has three values.
+    dtype = mean.sonine.dtype
+    at_three = jax.vmap(impacts_of)(jnp.asarray([0.0, 1.0, -1.0], dtype))
+    of_T = points[:, 0]  # 0, 1 or -1: a place among the three
+    at_points = jax.tree.map(lambda x: x[of_T], at_three)
+    rates, squares = jax.vmap(at_point)(jnp.asarray(points, dtype), *at_points)
     size = rates.shape[1]
     jacobian = (rates[1 : 2 * size : 2] - rates[2 : 2 * size + 1 : 2]).T / (2 * STEP)
     moments = squares[0]
