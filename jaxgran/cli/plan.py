@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import jaxgran
 from jaxgran import plotting
 from jaxgran.cli.fit import as_json, parse_settings
@@ -20,6 +22,7 @@ from jaxgran.data.header import (
     priors_of_header,
 )
 from jaxgran.data.scene_file import errors_of, read_scene_file, times_of
+from jaxgran.fitting.twins import twin
 
 
 def run_plan(
@@ -88,18 +91,18 @@ def read_experiment(path: Path) -> jaxgran.Measurement:
     errors = errors_of(experiment)
     if "rotational_temperature" in errors and gas.surface is None:
         raise ValueError("T_rot_err needs rough grains: give beta_t, or leave out T_rot_err")
-    curve = jaxgran.cool(gas, times_of(experiment))
-    planned = {}
+    if "displacement" in errors and gas.container is not None:
+        raise ValueError("displacement is not known in this scene: leave its error out")
+    times = times_of(experiment)
+    ones = np.ones_like(times)
+    planned: dict[str, Any] = {"temperature": ones}
     for name, error in errors.items():
-        values = getattr(curve, name)
-        if values is None:
-            raise ValueError(f"{name} is not known in this scene: leave its error out")
-        planned[f"{name}_error"] = error * values
-    unplanned = {"rotational_temperature", "displacement"} - errors.keys()
-    planned |= dict.fromkeys(unplanned)
-    return jaxgran.Measurement(
+        planned[name] = ones
+        planned[f"{name}_error"] = error * ones
+    curve = jaxgran.CoolingCurve(times, **planned, status=np.zeros((), int))
+    measurement = jaxgran.Measurement(
         gas,
-        dataclasses.replace(curve, **planned),
+        curve,
         num_particles=header_count(header, "N"),
         replicas=header_count(header, "replicas") or 1,
         priors=priors_of_header(header),
@@ -108,6 +111,7 @@ def read_experiment(path: Path) -> jaxgran.Measurement:
         errors_measured="temperature" in errors,
         header=tuple(header.items()),
     )
+    return twin(measurement)
 
 
 def details_of(planned: jaxgran.Plan) -> dict[str, Any]:
