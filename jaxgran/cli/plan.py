@@ -11,6 +11,7 @@ import numpy as np
 
 import jaxgran
 from jaxgran import plotting
+from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.cli.fit import as_json, parse_settings
 from jaxgran.cli.page import command_of, question_of, sections_of_plan, write_page
 from jaxgran.data.curve import import_extra
@@ -99,7 +100,8 @@ def read_experiment(path: Path) -> jaxgran.Measurement:
     for name, error in errors.items():
         planned[name] = ones
         planned[f"{name}_error"] = error * ones
-    curve = jaxgran.CoolingCurve(times, **planned, status=np.zeros((), int))
+    planned["status"] = np.zeros((), int)
+    curve = jaxgran.CoolingCurve(times, **as_jax_arrays(planned))
     measurement = jaxgran.Measurement(
         gas,
         curve,
