@@ -25,7 +25,7 @@ from experiments.support.record import EXPERIMENTS, FIGURES, PICTURES, figures
 ROOT = EXPERIMENTS.parent
 TEMPLATES = EXPERIMENTS / "templates"
 FRONT = ROOT / "README.md"
-BLOCKS = {"models": FRONT, "dilute": FRONT, "gallery": EXPERIMENTS / "README.md"}
+BLOCKS = {"models": FRONT, "gallery": EXPERIMENTS / "README.md"}
 USUAL = {"version": "0.1.0", "machine": "two-core CPU", "precision": "float64"}
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 

@@ -12,10 +12,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import jaxgran
-from experiments.support.record import DATA
 
 jax.config.update("jax_enable_x64", True)
-measurement = jaxgran.read_measurement(DATA / "lammps_cooling_dilute.csv")
+measurement = jaxgran.example_measurement()
 print(measurement)
 
 # %% [markdown]

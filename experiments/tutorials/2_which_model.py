@@ -20,11 +20,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import jaxgran
-from experiments.support.record import DATA
 from jaxgran.plotting import COLOURS
 
 jax.config.update("jax_enable_x64", True)
-measurement = jaxgran.read_measurement(DATA / "lammps_cooling_dense.csv")
+measurement = jaxgran.example_measurement("dense")
 gas, curve = measurement.gas, measurement.curve
 times, measured = curve.times[1:40:3], curve.temperature[1:40:3]
 print(f"packing fraction {gas.packing_fraction:.2f}, mean free time {gas.mean_free_time:.2g} s")
@@ -74,5 +73,5 @@ plt.show()
 # Kinetic theory, DSMC and hard spheres cool too fast at late times. Impacts of DSMC and of hard
 # spheres are over at once, whereas here they last a sixth of a free flight; and DSMC does not know
 # that in a dense gas the velocities of neighbours become alike, which kinetic theory includes in
-# part. Only soft spheres agree with LAMMPS to the noise of so few particles, in a hundred times the
-# time of kinetic theory.
+# part. Only soft spheres agree with LAMMPS to the noise of so few particles. They also take the
+# longest time, by the table above.

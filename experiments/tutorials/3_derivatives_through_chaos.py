@@ -57,9 +57,8 @@ axes.semilogy(same.collisions, apart, "o-", color="#e69f00")
 axes.set(xlabel="collisions per sphere", ylabel="distance of the two runs / diameter")
 
 # %% [markdown]
-# The distance grows exponentially, here by $10^8$ in 12 collisions. Exact differentiation of the
-# code would return this growth: a derivative of ten million diameters, which differs from run to
-# run.
+# The distance grows exponentially, by the factor printed above. Exact differentiation of the code
+# would return this growth: a derivative of millions of diameters, which differs from run to run.
 #
 # `jaxgran` propagates tangents through every impact, but projects them between impacts onto what a
 # mean over particles can depend on (the scale of the velocities, and the flow). What remains is the

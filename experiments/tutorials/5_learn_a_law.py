@@ -14,10 +14,9 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 
 import jaxgran
-from experiments.support.record import DATA
 
 jax.config.update("jax_enable_x64", True)
-measurement = jaxgran.read_measurement(DATA / "lammps_cooling_dilute.csv")
+measurement = jaxgran.example_measurement()
 grains, curve = measurement.gas, measurement.curve
 
 # %% [markdown]

@@ -46,13 +46,3 @@ def test_links_lead_somewhere(path):
             heads = re.findall(r"^#+ (.*)$", other.read_text(encoding="utf-8"), re.MULTILINE)
             names = [re.sub(r"[^\w -]", "", head.lower()).replace(" ", "-") for head in heads]
             assert anchor in names, f"{path.name}: {other.name} has no heading {anchor}"
-
-
-@pytest.mark.slow
-def test_python_of_the_documents_runs():
-    names, pages = {}, (ROOT / "README.md", EXPERIMENTS / "guide.md")
-    text = "".join(page.read_text(encoding="utf-8") for page in pages)
-    for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
-        exec(block, names)
-    assert names["sweep"].shape == (1000, 50) and names["slope"].shape == (50,)
-    assert names["curve"].rotational_temperature.shape == (50,)
