@@ -29,4 +29,5 @@ def as_markdown(docstring: str) -> str:
 
 
 def escaped(text: str) -> str:
+    text = re.sub(r"::\n", ":\n", text)
     return CODE_OR_LESS.sub(lambda match: "&lt;" if match[0] == "<" else match[0], text)
