@@ -55,3 +55,11 @@ def test_the_command_fits_a_file_in_an_empty_folder(run, tmp_path):
 def test_tutorial_runs(name, run):
     printed = run("-W", "error", ROOT / "docs" / "pages" / "tutorials" / f"{name}.py")
     assert re.search(TUTORIALS[name], printed), printed
+
+
+def test_the_description_links_to_nothing_that_is_not_in_the_wheel(wheel):
+    with zipfile.ZipFile(wheel) as content:
+        (name,) = (name for name in content.namelist() if name.endswith("METADATA"))
+        description = content.read(name).decode()
+    targets = re.findall(r"\]\(([^)]*)\)", description)
+    assert targets and all(target.startswith("https://") for target in targets)
