@@ -5,10 +5,8 @@ import json
 import os
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
-import time
 
 import jax
 import jax.numpy as jnp
@@ -271,17 +269,6 @@ def test_bad_input_is_answered_with_one_line(measured, run, arguments):
     assert status == 2 and error.startswith("error: ") and BAD_INPUT[arguments] in error
     assert len(checks) == ("Y=0.05" in arguments)  # an unusual value is asked about
     assert not out and not (measured / "results").exists()
-
-
-def test_an_interrupt_while_jax_is_imported_ends_the_command_quietly():
-    line = "import sys; print(1, flush=True); from jaxgran_command import main; sys.exit(main())"
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen([sys.executable, "-c", line, "fit", "none.csv"], **pipes) as process:
-        process.stdout.readline()
-        time.sleep(0.3)
-        process.send_signal(signal.SIGINT)
-        assert process.communicate()[1] == ""
-    assert process.returncode == -signal.SIGINT
 
 
 @pytest.mark.parametrize("fault, code", [(KeyboardInterrupt, 130), (BrokenPipeError, 0)])

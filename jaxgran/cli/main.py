@@ -1,5 +1,6 @@
 """The command line: `jaxgran fit`, `jaxgran plan`, `jaxgran cool` and `jaxgran choose`."""
 
+import gc
 import os
 import sys
 import time
@@ -30,6 +31,22 @@ APP = App(
     default_parameter=Parameter(negative=()),
     suppress_keyboard_interrupt=False,
 )
+
+
+def start() -> int:
+    """Run `main` as a process of its own: the entry point of the command `jaxgran`.
+
+    Tracing makes many objects that stay. Searching them for garbage seldom, and not at the end,
+    saves 1.3 s of the 6.6 s of processor time that the fit of the README takes.
+
+    Returns:
+        The exit code.
+    """
+    gc.set_threshold(1_000_000)
+    try:
+        return main()
+    finally:
+        gc.freeze()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

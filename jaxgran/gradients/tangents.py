@@ -15,9 +15,9 @@ parameter p is projected onto few numbers:
   spheres rotate, that grow by what each impact, wall, drag and drive exchange.
 
 In a box longer than L_c a gas also remembers its flow, and these derivatives are too large.
-``experiments/accuracy.md`` has figures of projections that keep more of the tangents there: none of
-them is right at 100 collisions per particle, so the package has none. Use differences of
-runs (`jaxgran.gradients.differences`) in such boxes.
+``docs/pages/validation/accuracy.md`` has figures of projections that keep more of the tangents
+there: none of them is right at 100 collisions per particle, so the package has none. Use
+differences of runs (`jaxgran.gradients.differences`) in such boxes.
 """
 
 from typing import Any, NamedTuple
