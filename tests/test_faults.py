@@ -236,6 +236,28 @@ def test_a_solver_that_fails_has_no_derivative():
     assert np.all(np.isnan(jax.jit(jax.value_and_grad(temperature))(GAS.dissipative_constant)))
 
 
+@pytest.mark.parametrize(
+    "model",
+    [
+        jaxgran.KineticTheory(),
+        DSMC,
+        pytest.param(jaxgran.HardSpheres(20), marks=pytest.mark.slow),
+        pytest.param(SOFT, marks=pytest.mark.slow),
+    ],
+)
+def test_models_run_without_promotion_of_types(model):
+    save = "particles" if model.saves else None
+    sized = model.sized_for(GAS)
+
+    def temperature(A):
+        return cool(GAS.replace(dissipative_constant=A), model=sized, save=save).temperature[0]
+
+    A = GAS.value("dissipative_constant")
+    with jax.numpy_dtype_promotion("strict"):
+        assert np.isfinite(cool(model=model, save=save).temperature[0])
+        jax.eval_shape(jax.jit(jax.vmap(jax.grad(temperature))), A[None])
+
+
 def test_what_tree_at_changed_is_checked():
     gas = eqx.tree_at(lambda gas: gas.diameter, GAS, jnp.asarray(-1.0))
     with pytest.raises(ValueError, match="diameter must lie in"):

@@ -412,7 +412,7 @@ def _check_signs(
 
 
 NOISE = 3.0
-"""T over its error below which a row does not count as above the noise."""
+"""T, or <dr^2>, over its error below which a row does not count as above the noise."""
 
 
 def above_noise(curve: CoolingCurve) -> np.ndarray:

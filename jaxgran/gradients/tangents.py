@@ -267,7 +267,8 @@ class ExchangeTangents(NamedTuple):
 
         first = ratio_or_zero(self.energies, before[None])
         middle = ratio_or_zero(self.energies + growth(first) / 2, (before + gained / 2)[None])
-        more = sooner[:, 0] * collisions[None] + middle[:, 0] / 2 * collisions[None]
+        number = collisions.astype(self.collisions.dtype)[None]
+        more = sooner[:, 0] * number + middle[:, 0] / 2 * number
         return self._replace(
             energies=self.energies + growth(middle), collisions=self.collisions + more
         )
