@@ -16,8 +16,8 @@ parameter p is projected onto few numbers:
 
 Both leave out that a parameter changes the shape of the velocity distribution. After 10 to 100 mean
 free times of smooth spheres in 3D d ln T/d ln A is .2 % too large at a thermal beta of .03 and .09,
-and .1 % too small at .15, 1 % at .3, 2.4 % at .5, 5 % at 1. These are figures of kinetic theory with
-a_2(t) kept fixed; DSMC agrees with them at .09 and 1.
+and .1 % too small at .15, 1 % at .3, 2.4 % at .5, 5 % at 1. The figures are from kinetic theory
+with a_2(t) kept fixed, and DSMC agrees with them at .09 and 1.
 
 In a box longer than L_c a gas also remembers its flow, and these derivatives are too large.
 ``experiments/accuracy.md`` has figures of projections that keep more of the tangents there: none of
