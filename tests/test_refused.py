@@ -227,6 +227,10 @@ CALLS = [
     (lambda: measured(gas=GAS.replace(mass=np.ones(4))), "vmap"),
     (lambda: cool(model=jaxgran.SoftSpheres), "got the class SoftSpheres"),
     (lambda: cool(model=3), "model must be a jaxgran model, got 3"),
+    (
+        lambda: cool(GAS.replace(diameter=1e-300), model=jaxgran.HardSpheres(20)),
+        "diameter 1e-300 m is so small that the volume of a sphere is 0",
+    ),
     (lambda: cool(model=SOFT, key=5), "jax.random.key.5., got 5"),
     (lambda: cool(model=SOFT, checkpoint=5), "checkpoint must be a path"),
     (lambda: cool(times=[1j]), "times must be a list of numbers"),
