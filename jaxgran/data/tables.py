@@ -126,7 +126,7 @@ def read_text(path: Path, columns: str) -> str:
         columns: names of the columns that it should have, for the message.
 
     Raises:
-        ValueError: if the file is empty or is no text.
+        ValueError: if the file is empty or not a text file.
         OSError: if it cannot be read.
     """
     content = read_bytes(path)
@@ -527,7 +527,7 @@ def _factor(name: str, told: dict[str, str], units: dict[str, str], kind: str) -
         return 1.0
     try:
         return unit_in(unit, base)
-    except Exception:  # pint raises errors of many types for text that is no unit
+    except Exception:  # pint raises errors of many types for text that is not a unit
         advice = f"write a unit such as {base}, or leave it out"
         if base == "m^2/s^2":
             advice = "T is <v^2>/d, in m^2/s^2: multiply kelvin by 1.38e-23 J/K over the mass"
@@ -548,7 +548,7 @@ def unit_in(unit: str, base: str) -> float:
         raise ValueError("units have powers of one digit")
     parsed = _units().parse_units(text)
     if "pixel" in str(parsed):  # which pint takes for 1/96 inch
-        raise ValueError("a pixel is no length")
+        raise ValueError("a pixel is not a length")
     factor = _units().Quantity(1.0, parsed).to("" if base == "1" else base).magnitude
     return float(f"{factor:.15g}")  # without the rounding errors of several factors
 

@@ -1,11 +1,11 @@
 """Two memories of a derivative: what is kept of the tangent of a chaotic gas.
 
-The trajectories of a gas diverge by a factor of e^2 to e^5 per collision, and the exact derivative
-of a run with them: after a few collisions it says nothing about the mean. But a homogeneous gas
-forgets all of its microscopic state except its temperature, and a change of temperature is only a
-change of clock: with velocities s times as large, and with ``alpha s^2`` and ``A / s`` in place of
-alpha and A, the particles follow the same paths s times as fast. So the tangent of a state in a
-parameter p is projected onto few numbers:
+In each mean free time the trajectories of a gas diverge by a factor of 6 (phi = .1) to 120
+(phi = .02), and the exact derivative of a run with them: after a few collisions it says nothing
+about the mean. But a homogeneous gas forgets all of its microscopic state except its temperature,
+and a change of temperature is only a change of clock: with velocities s times as large, and with
+``alpha s^2`` and ``A / s`` in place of alpha and A, the particles follow the same paths s times as
+fast. So the tangent of a state in a parameter p is projected onto few numbers:
 
 - `ContactTangents`, of gases of lasting contacts: ``c = d ln T/dp`` and the tangent of the clock.
   The derivative at a fixed time is the derivative at a fixed place in the sequence of collisions
