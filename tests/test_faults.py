@@ -305,6 +305,30 @@ def test_programs_are_dropped_before_the_limit_of_memory_maps(monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.minutes
+def test_many_numbers_of_spheres_stay_below_a_limit_of_memory_maps(monkeypatch):
+    maps = Path("/proc/self/maps")
+    if not maps.exists():
+        pytest.skip("not Linux")
+
+    def num_maps():
+        return len(maps.read_bytes().splitlines())
+
+    # One number of spheres adds some 1100 maps; the limit of Linux would need 40 of them.
+    allowed = num_maps() + 2500
+    limit = int(Path("/proc/sys/vm/max_map_count").read_text())
+    monkeypatch.setattr(tracing, "MAX_MAP_SHARE", allowed / limit)
+    counts = []
+    for number in range(30, 38):
+        curve = cool(times=[0.1 * TAU], model=jaxgran.HardSpheres(number))
+        assert np.isfinite(curve.temperature[0])
+        counts.append(num_maps())
+    print(counts, allowed)
+    assert max(counts) < allowed + 1200  # programs of one number, after the last check
+    assert np.sum(np.diff(counts) < 0) >= 2
+
+
+@pytest.mark.slow
 def test_a_gas_that_never_collides_is_equilibrated_at_once():
     gas = GAS.replace(packing_fraction=1e-12)
     began = time.monotonic()
