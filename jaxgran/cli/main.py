@@ -65,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             warnings.simplefilter("always", UserWarning)
             # A damaged cache is compiled again.
             warnings.filterwarnings("ignore", "Error (read|writ)ing persistent compilation cache")
-            warnings.showwarning = lambda text, *_: print(f"check: {text}", file=sys.stderr)
+            warnings.showwarning = lambda text, *_: print(f"warning: {text}", file=sys.stderr)
             APP(words, exit_on_error=False, print_error=False, result_action="return_value")
         sys.stdout.flush()
     except KeyboardInterrupt:
@@ -177,7 +177,7 @@ def cool(
         common.use_compilation_cache()
     picture = out.with_suffix(".png")
     if picture == out:
-        raise ValueError(f"--out {out} is the name of the picture. Give the CSV file another one.")
+        raise ValueError(f"--out must not end in .png, got {out}. The picture is named after it.")
     given = _read_scene(scene, until)
     for file in (out, picture):
         if file.exists() and not overwrite:

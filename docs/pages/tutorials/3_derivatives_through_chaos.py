@@ -60,9 +60,10 @@ axes.set(xlabel="collisions per sphere", ylabel="distance of the two runs / diam
 # The distance grows exponentially, by the factor printed above. Exact differentiation of the code
 # would return this growth: a derivative of millions of diameters, which differs from run to run.
 #
-# `jaxgran` propagates tangents through every impact, but projects them between impacts onto what a
-# mean over particles can depend on (the scale of the velocities, and the flow). What remains is the
-# derivative of the temperature. It is what `jax.jvp`, `jax.grad` and `jax.jacfwd` return:
+# `jaxgran` propagates tangents through every impact, but keeps only what a mean over particles
+# depends on in a homogeneous gas: the scale of the velocities. A flow, which grows in boxes longer
+# than $L_c$, is not kept. What remains is the derivative of the temperature. It is what `jax.jvp`,
+# `jax.grad` and `jax.jacfwd` return:
 
 
 # %%
