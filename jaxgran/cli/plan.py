@@ -96,12 +96,12 @@ def read_experiment(path: Path) -> jaxgran.Measurement:
         raise ValueError("displacement is not known in this scene: leave its error out")
     times = times_of(experiment)
     ones = np.ones_like(times)
-    planned: dict[str, Any] = {"temperature": ones}
+    planned: dict[str, Any] = {"times": times, "temperature": ones}
     for name, error in errors.items():
         planned[name] = ones
         planned[f"{name}_error"] = error * ones
     planned["status"] = np.zeros((), int)
-    curve = jaxgran.CoolingCurve(times, **as_jax_arrays(planned))
+    curve = jaxgran.CoolingCurve(**as_jax_arrays(planned))
     measurement = jaxgran.Measurement(
         gas,
         curve,
