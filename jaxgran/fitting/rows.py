@@ -13,11 +13,13 @@ from jaxgran._utils.validation import float_array
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import Measurement
+from jaxgran.fitting.parameters import with_floats
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.choose import error_model_along
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.linearise import (
     curve_of_program,
+    with_coulomb_limit,
     with_neutral_elements,
     with_variant_law,
 )
@@ -230,8 +232,8 @@ class DropRows:
 
     @property
     def gas(self) -> Gas:
-        """The gas of the spheres, with the law that alternative explanations change."""
-        return with_variant_law(self.measurement.gas)
+        """The gas of the spheres, with the law and the friction that alternatives change."""
+        return with_variant_law(with_coulomb_limit(self.measurement.gas))
 
     @property
     def scene(self) -> Gas:
@@ -244,10 +246,23 @@ class DropRows:
         assert isinstance(self.measurement.data, DropTest)
         return self.measurement.data
 
+    def widening(self, values: dict[str, Any]) -> np.ndarray:
+        """Return the factor by which eps that scatters from impact to impact widens each error.
+
+        Args:
+            values: of floats of the gas, by name; "spread" is the scatter of eps.
+        """
+        factors = np.ones(self.data.num_values)
+        spread = float(values.get("spread", 0.0))
+        if spread > 0:
+            errors = np.asarray(self.data.errors(with_floats(self.gas, values)))
+            factors[: errors.size] = np.hypot(1.0, spread / errors)
+        return factors
+
     @property
     def num_points(self) -> int:
-        """Number of impacts."""
-        return int(np.size(self.data.restitution))
+        """Number of measured values of restitution."""
+        return self.data.num_values
 
     @property
     def nuisances(self) -> dict[str, float]:
