@@ -8,7 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxgran._utils.validation import NON_NEGATIVE, POSITIVE, UserNumber, check_bool, float_array
+from jaxgran._utils.validation import (
+    NON_NEGATIVE,
+    POSITIVE,
+    Domain,
+    UserNumber,
+    check_bool,
+    float_array,
+)
 from jaxgran.scene.elements import Rough
 from jaxgran.scene.gas import Gas
 
@@ -56,6 +63,10 @@ class DropTest(eqx.Module):
         speed_error: standard error of each speed, m/s, shape (n,), >= 0, where eps is the ratio of
             two measured speeds; `error` is then that of the speed after over the speed before.
             None if the speeds are known.
+        correlation: of the errors of the speeds before and after, shape (n,), in [-1, 1]; None
+            for 0.
+        scatters: whether eps scatters from impact to impact by more than its error, as rough
+            surfaces make it; a fit then estimates the standard deviation of this scatter.
 
     Raises:
         ValueError: for a value out of its range, or lists of different lengths.
@@ -76,6 +87,8 @@ class DropTest(eqx.Module):
     tangential_error: UserNumber | None = eqx.field(converter=_floats_or_none, default=None)
     of_centres: bool = eqx.field(static=True, default=False)
     speed_error: UserNumber | None = eqx.field(converter=_floats_or_none, default=None)
+    correlation: UserNumber | None = eqx.field(converter=_floats_or_none, default=None)
+    scatters: bool = eqx.field(static=True, default=False)
 
     advice: ClassVar[dict[str, str]] = {
         "speed": "Give normal speeds in m/s.",
@@ -90,7 +103,7 @@ class DropTest(eqx.Module):
     }
 
     def __check_init__(self):
-        check_bool(of_centres=self.of_centres)
+        check_bool(of_centres=self.of_centres, scatters=self.scatters)
         if self.onto not in PARTNERS:
             raise ValueError(f"onto must be one of {', '.join(PARTNERS)}, got {self.onto!r}")
         given = [name for name in OBLIQUE if getattr(self, name) is not None]
@@ -101,8 +114,10 @@ class DropTest(eqx.Module):
             POSITIVE.check(name, getattr(self, name), self.advice[name])
         if self.speed_error is not None:
             NON_NEGATIVE.check("speed_error", self.speed_error, self.advice["speed_error"])
+        if self.correlation is not None:
+            Domain(-1, 1, True, True).check("correlation", self.correlation, "Give none for 0.")
         names = ["speed", "restitution", "error", *given]
-        names += ["speed_error"] * (self.speed_error is not None)
+        names += [x for x in ("speed_error", "correlation") if getattr(self, x) is not None]
         shapes = [np.shape(getattr(self, name)) for name in names]
         if len(shapes[0]) != 1 or len(set(shapes)) > 1 or shapes[0] == (0,):
             raise ValueError(
@@ -136,11 +151,16 @@ class DropTest(eqx.Module):
 
     def errors_of_ratio(self) -> Float[np.ndarray, "n"]:
         """Return the standard error of each eps, with that of the speed before the impact."""
-        error = np.asarray(self.error)
+        return np.asarray(self._error_with(np.asarray(self.restitution)))
+
+    def _error_with(self, slope: Array | np.ndarray) -> Float[Array, "n"]:
+        """Return the error of the speed after minus `slope` times that before, over the latter."""
+        error = jnp.asarray(self.error)
         if self.speed_error is None:
             return error
-        relative = np.asarray(self.speed_error) / np.asarray(self.speed)
-        return np.hypot(error, np.asarray(self.restitution) * relative)
+        relative = slope * jnp.asarray(self.speed_error) / jnp.asarray(self.speed)
+        shared = 0.0 if self.correlation is None else jnp.asarray(self.correlation)
+        return jnp.sqrt(error**2 + relative**2 - 2 * shared * error * relative)
 
     def check_gas(self, gas: Gas) -> None:
         """Raise ValueError for a gas that lacks the elements on which these impacts depend."""
@@ -196,12 +216,7 @@ class DropTest(eqx.Module):
 
     def errors(self, gas: Gas) -> Float[Array, "n"]:
         """Return the standard error of eps minus that computed at the measured speed."""
-        error = jnp.asarray(self.error)
-        if self.speed_error is None:
-            return error
-        slope = self._with_slope(gas)[1]
-        relative = jnp.asarray(self.speed_error) / jnp.asarray(self.speed)
-        return jnp.sqrt(error**2 + (slope * relative) ** 2)
+        return self._error_with(self._with_slope(gas)[1])
 
     def residuals(self, gas: Gas) -> Float[Array, "values"]:
         """Return measured minus computed restitution over the error, for spheres of a gas.

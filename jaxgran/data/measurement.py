@@ -230,8 +230,9 @@ def read_measurement(
         header: entries that count as those of the file, before anything is read; they replace
             entries with the same key. Keys are those of `jaxgran.data.header.gas_of_header` and
             `priors_of_header`, N, replicas, absent, tracked, T0_of ("run" or "ensemble"),
-            T_scale_err, errors ("measured"), which stand for the arguments of `Measurement`, onto
-            (of a drop test: "sphere", "plate" or "wall") and spin_before ("0"), and those of tracks.
+            T_scale_err, errors ("measured"), which stand for the arguments of `Measurement`, those
+            of drop tests, onto ("sphere", "plate" or "wall") and spin_before ("0"), and those of
+            tracks.
         gas: the gas in place of that of the header, such as that of a curve for a drop test.
 
     Returns:
