@@ -17,10 +17,11 @@ from jaxgran._utils.formatting import text_table
 from jaxgran.data import files, tracks
 from jaxgran.data.curve_file import CSV_FILE
 from jaxgran.data.drop_test import MAX_SIGMAS, SPHERE, WALL, DropTest
-from jaxgran.data.header import checked_header, gas_of_header
+from jaxgran.data.header import checked_header, gas_of_header, priors_of_header
 from jaxgran.data.measurement import Measurement
 from jaxgran.data.tables import header_in_si, read_table
 from jaxgran.scene.gas import Gas
+from jaxgran.scene.parameters import MATERIAL, PARAMETERS
 
 MIN_FRAMES = 3
 """Least number of frames of a free flight: two for the line, and one that tells its error."""
@@ -76,18 +77,21 @@ class Impacts(NamedTuple):
             they were "grazing" (they may have missed), had "few frames" (other impacts overlap or
             follow, or a track ends), were "bent" (a flight is not straight), or "impossible" (eps
             outside [0, 1] by 5 errors: wrong identities, or no impact).
+        places: of the impacts of spheres: the numbers of both particles, in increasing order of
+            their identities from 0 on, and the times, s.
         localisation_error: standard error of one coordinate, m, as given or as the scatter about
             the lines shows.
         header: of the file, in SI.
         gas: that the header describes.
 
-    >>> jaxgran.read_impacts.__name__
-    'read_impacts'
+    >>> jaxgran.Impacts(None, None, {"used": 0}, ([], [], []), 4e-5, {}, gas).measurements
+    {}
     """
 
     spheres: DropTest | None
     walls: DropTest | None
     counts: dict[str, int]
+    places: tuple[np.ndarray, np.ndarray, np.ndarray]
     localisation_error: float
     header: dict[str, str]
     gas: Gas
@@ -96,9 +100,15 @@ class Impacts(NamedTuple):
     def measurements(self) -> dict[str, Measurement]:
         """The drop tests with their gas, by the labels "impacts" and "wall impacts"."""
         found = {"impacts": self.spheres, "wall impacts": self.walls}
-        header = tuple(self.header.items())
+        counts = ", ".join(f"{count} {name}" for name, count in self.counts.items())
+        header = tuple((self.header | {"impacts_from": f"tracks: {counts}"}).items())
+        priors = {
+            name: known
+            for name, known in priors_of_header(self.header).items()
+            if name in self.gas.domains and PARAMETERS[name].belongs_to == MATERIAL
+        }
         return {
-            label: Measurement(self.gas, test, header=header)
+            label: Measurement(self.gas, test, priors=priors, header=header)
             for label, test in found.items()
             if test is not None
         }
@@ -144,13 +154,16 @@ def read_impacts(path: str | Path, header: dict[str, Any] | None = None) -> Impa
         ValueError: for two coordinates of a gas in three dimensions, trajectories and curves,
             tracks without impacts, and whatever the header says that no model has, such as rods.
 
-    >>> rows = [f"{i},{t / 500},{x},0,0" for i, v in ((1, 0.1), (2, 0.0)) for t in range(40)
-    ...     for x in [2e-3 * i - 5e-3 + (v * min(t, 20) + (0.095 - v * 0.95) * max(t - 20, 0)) / 500
-    ...     if i == 1 else 2e-3 * i - 1e-3 + 0.095 * max(t - 20, 0) / 500]]
+    >>> t = jnp.arange(40) / 500  # s; the first sphere flies at .1 m/s and hits the second one
+    >>> x = jnp.stack([jnp.where(t < 0.04, 0.1 * t, 0.004 + 0.005 * (t - 0.04)),
+    ...     0.006 + jnp.where(t < 0.04, 0.0, 0.095 * (t - 0.04))])
+    >>> rows = [f"{i},{t[k]},{x[i, k]},0,{1e-9 * k}" for k in range(40) for i in range(2)]
+    >>> with open("tracks.csv", "w") as file:
+    ...     _ = file.write("\\n".join(["id,t,x,y,z", *rows]))
     >>> known = {"eta": 0.05, "diameter": "2 mm", "density": 2387, "Y": 5e7, "nu": 0.22, "T0": 0.01}
-    >>> _ = open("tracks.csv", "w").write("\\n".join(["id,t,x,y,z", *rows]))
-    >>> impacts = jaxgran.read_impacts("tracks.csv", known | {"localisation_error": 1e-6})
-    >>> impacts.counts["used"], round(float(impacts.spheres.restitution[0]), 2)
+    >>> known |= {"localisation_error": 1e-6}
+    >>> impacts = jaxgran.read_impacts("tracks.csv", known)
+    >>> impacts.counts["used"], round(float(impacts.spheres.restitution[0]), 3)
     (1, 0.9)
     """
     path = files.checked_path(path, CSV_FILE)
@@ -392,7 +405,7 @@ def _impacts_of(motion: _Motion, gas: Gas, header: dict[str, str]) -> Impacts:
         events = events._replace(
             time=np.where(timed, meeting.time, first.time),
             half_width=np.where(timed, np.minimum(frames_off, first.half_width), first.half_width),
-            is_break=~(known & meeting.misses),
+            is_break=~(known & meeting.misses & (meeting.count_before >= MIN_FRAMES)),
         )
         motion = motion._replace(error=_scatter_about_lines(motion, events, header))
         meeting = _meeting(motion, events, first.time, diameter)
@@ -737,4 +750,7 @@ def _summary(
             f"the tracks show no impact with {MIN_FRAMES} frames before and after it ({reasons}): "
             "film at a higher rate, and check diameter and length_unit"
         )
-    return Impacts(spheres, walls, counts, motion.error, header, gas)
+    of_spheres = left & ~is_wall
+    first, second, times = events.first, events.second, meeting.time
+    places = first[of_spheres], second[of_spheres], times[of_spheres]
+    return Impacts(spheres, walls, counts, places, motion.error, header, gas)

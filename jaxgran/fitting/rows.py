@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scipy  # which imports scipy.optimize at its first use
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran._utils.tracing import grid_size
@@ -53,6 +54,9 @@ UNKNOWN_NUMBER = 1e3
 
 SCATTER_ERROR = 0.05
 """Relative error of the variance that theory gives to a run of N grains."""
+
+MIN_SCATTER = 1e-3
+"""Smallest scatter of eps that is searched, over the smallest error."""
 
 ERRORS_OF_PARTICLES = 0.1
 """Relative difference up to which T_err is taken for the fluctuation of independent samples."""
@@ -246,17 +250,22 @@ class DropRows:
         assert isinstance(self.measurement.data, DropTest)
         return self.measurement.data
 
-    def widening(self, values: dict[str, Any]) -> np.ndarray:
+    def widening(self, values: dict[str, Any], residuals: np.ndarray) -> np.ndarray:
         """Return the factor by which eps that scatters from impact to impact widens each error.
 
         Args:
-            values: of floats of the gas, by name; "spread" is the scatter of eps.
+            values: of floats of the gas, by name; "spread" is the scatter of eps. Without it the
+                most likely scatter is taken where eps scatters (`DropTest.scatters`).
+            residuals: measured minus computed values, over their errors.
         """
         factors = np.ones(self.data.num_values)
+        if "spread" not in values and not self.data.scatters:
+            return factors
+        errors = np.asarray(self.data.errors(with_floats(self.gas, values)))
         spread = float(values.get("spread", 0.0))
-        if spread > 0:
-            errors = np.asarray(self.data.errors(with_floats(self.gas, values)))
-            factors[: errors.size] = np.hypot(1.0, spread / errors)
+        if "spread" not in values:
+            spread = most_likely_scatter(residuals[: errors.size], errors)
+        factors[: errors.size] = np.hypot(1.0, spread / errors)
         return factors
 
     @property
@@ -268,6 +277,27 @@ class DropRows:
     def nuisances(self) -> dict[str, float]:
         """It has no nuisance parameters."""
         return {}
+
+
+def most_likely_scatter(residuals: np.ndarray, errors: np.ndarray) -> float:
+    """Return the standard deviation of the scatter of values beyond their errors, >= 0.
+
+    It maximises the likelihood of Gaussian values; -2 ln L then has no slope in it.
+
+    Args:
+        residuals: differences over their errors.
+        errors: standard errors.
+    """
+    square = (residuals * errors) ** 2
+
+    def misfit(log_variance: float) -> float:
+        variance = errors**2 + np.exp(log_variance)
+        return float(np.sum(square / variance + np.log(variance)))
+
+    largest = np.log(np.max(square) + np.max(errors) ** 2)
+    least = 2 * np.log(MIN_SCATTER * np.min(errors))
+    found = scipy.optimize.minimize_scalar(misfit, bounds=(least, largest), method="bounded")
+    return float(np.exp(found.x / 2))
 
 
 def curve_rows(
