@@ -49,8 +49,8 @@ THROUGH_LEVEL = 0.05
 """The same of the two flights of an encounter together, above which it changed no velocity."""
 
 WALL_TOLERANCE = 0.05
-"""Largest difference of the extent of all positions from the side of the container less a diameter,
-in diameters."""
+"""Largest difference of the extent of all positions, beyond their errors, from the side of the
+container less a diameter, in diameters."""
 
 MAX_GAP = 2
 """Largest number of frames between two frames of one encounter."""
@@ -497,7 +497,8 @@ def _encounters_with_walls(motion: _Motion, gas: Gas) -> _Events:
     assert gas.container is not None
     room = np.broadcast_to(np.asarray(gas.container.side), (d,)) - float(gas.diameter)
     low, high = motion.position.min(axis=0), motion.position.max(axis=0)
-    if np.any(np.abs(high - low - room) > WALL_TOLERANCE * float(gas.diameter)):
+    allowed = WALL_TOLERANCE * float(gas.diameter) + 2 * MAX_SIGMAS * motion.error
+    if np.any(np.abs(high - low - room) > allowed):
         raise ValueError(
             "the positions extend over "
             f"{' x '.join(f'{x:.4g}' for x in high - low)} m, and walls at container_side leave "
@@ -638,11 +639,12 @@ def _meeting(
         of_place_after += counts * line_after.variance_at(time)
     place_error = motion.error * np.sqrt(of_place)
     speed_error = np.sqrt(variance * of_speed)
-    time_error = place_error / np.maximum(speed, speed_error + TINY)
+    slowest = motion.error / np.ptp(motion.time)
+    time_error = place_error / np.maximum(speed, speed_error + slowest)
     r_after = i_after.at(time) - to_second * j_after.at(time) - events.shift
     parted = _time_of_parting(r_after, g_after, events, diameter)
     after_error = motion.error * np.sqrt(of_place_after)
-    after_error = after_error / np.maximum(speed_after, np.sqrt(variance * of_after) + TINY)
+    after_error = after_error / np.maximum(speed_after, np.sqrt(variance * of_after) + slowest)
     agrees = np.abs(parted) < MISSED * np.hypot(time_error, after_error)
     share = np.where(agrees, time_error**2 / (time_error**2 + after_error**2 + TINY), 0.0)
     margin = diameter - parameter
