@@ -58,7 +58,7 @@ def test_the_scatter_of_eps_is_found_from_impact_to_impact(filmed, tmp_path):
     assert result.p_value > 0.01
     sharp = dataclasses.replace(test, scatters=False)
     assert jaxgran.fit(jaxgran.Measurement(filmed.gas, sharp)).p_value < 1e-6
-    error = 0.03 / len(test.speed)**0.5 / 0.1  # of 1 - eps, relative
+    error = 0.03 / len(test.speed) ** 0.5 / 0.1  # of 1 - eps, relative
     assert result.standard_error[0] / A == pytest.approx(error, rel=0.5)
 
 
