@@ -18,14 +18,13 @@ import sys
 from pathlib import Path
 
 from jaxgran.cli.main import main as command
-
-DEFAULT_CURVE = Path(__file__).parent / "data" / "lammps_cooling_dilute.csv"
+from jaxgran.data.example import EXAMPLE_FILES
 
 
 def main() -> int:
     """Run `jaxgran fit` with the arguments of this script and a default curve."""
     words = sys.argv[1:]
-    default = [] if any(Path(word).is_file() for word in words) else [str(DEFAULT_CURVE)]
+    default = [] if any(Path(word).is_file() for word in words) else [str(EXAMPLE_FILES["dilute"])]
     return command(["fit", *default, *words])
 
 

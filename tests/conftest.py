@@ -29,8 +29,8 @@ def pytest_addoption(parser):
     parser.addoption(
         "--record",
         action="store_true",
-        help="keep what tests with the marker `figures` find in experiments/figures/tests, from "
-        "which experiments/accuracy.md is made; in one process (-n 0)",
+        help="keep what tests with the marker `figures` find in experiments/recorded/tests, from "
+        "which the page on accuracy is made; in one process (-n 0)",
     )
 
 
@@ -46,10 +46,10 @@ def record():
 
 def pytest_sessionfinish(session, exitstatus):
     if session.config.option.record and exitstatus == 0:
-        from experiments.support.record import FIGURES, save
+        from experiments.support.record import RECORDED, save
 
         for name, rows in RESULTS.items():
-            save(FIGURES / "tests" / f"{name}.json", rows=rows)
+            save(RECORDED / "tests" / f"{name}.json", rows=rows)
 
 
 def pytest_configure(config):

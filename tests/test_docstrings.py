@@ -1,16 +1,11 @@
-"""The examples of the public docstrings run, and the API pages are made from them."""
+"""The examples of the public docstrings run."""
 
 import doctest
-import re
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
 import jaxgran
 
-README = Path(__file__).parents[1] / "README.md"
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 
@@ -43,19 +38,3 @@ NAMES = [pytest.param(x, marks=pytest.mark.slow) if x in LONG else x for x in ja
 def test_public_docstring_has_an_example_that_runs(name, names, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run(getattr(jaxgran, name).__doc__, dict(names), name)
-
-
-@pytest.mark.slow
-def test_api_pages_are_made_without_a_warning(tmp_path):
-    pytest.importorskip("pdoc")
-    (printed,) = re.findall(r"&& pdoc (.*)`", README.read_text(encoding="utf-8"))
-    command = [sys.executable, "-W", "error", "-m", "pdoc", *printed.split(), "-o", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "Warn" not in done.stderr and "Warn" not in done.stdout, done.stderr
-    pages = {"jaxgran": {*jaxgran.__all__} - {"observables"}}
-    pages["jaxgran/particles/observables"] = jaxgran.observables.__all__
-    for page, names in pages.items():
-        text = (tmp_path / f"{page}.html").read_text(encoding="utf-8")
-        for name in names:
-            assert f'id="{name}"' in text, f"{name} is not on the page {page}"

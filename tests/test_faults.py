@@ -236,6 +236,28 @@ def test_a_solver_that_fails_has_no_derivative():
     assert np.all(np.isnan(jax.jit(jax.value_and_grad(temperature))(GAS.dissipative_constant)))
 
 
+@pytest.mark.parametrize(
+    "model",
+    [
+        jaxgran.KineticTheory(),
+        DSMC,
+        pytest.param(jaxgran.HardSpheres(20), marks=pytest.mark.slow),
+        pytest.param(SOFT, marks=pytest.mark.slow),
+    ],
+)
+def test_models_run_without_promotion_of_types(model):
+    save = "particles" if model.saves else None
+    sized = model.sized_for(GAS)
+
+    def temperature(A):
+        return cool(GAS.replace(dissipative_constant=A), model=sized, save=save).temperature[0]
+
+    A = GAS.value("dissipative_constant")
+    with jax.numpy_dtype_promotion("strict"):
+        assert np.isfinite(cool(model=model, save=save).temperature[0])
+        jax.eval_shape(jax.jit(jax.vmap(jax.grad(temperature))), A[None])
+
+
 def test_what_tree_at_changed_is_checked():
     gas = eqx.tree_at(lambda gas: gas.diameter, GAS, jnp.asarray(-1.0))
     with pytest.raises(ValueError, match="diameter must lie in"):
@@ -280,6 +302,30 @@ def test_programs_are_dropped_before_the_limit_of_memory_maps(monkeypatch):
         with particle_run.compiling("a program", False):
             pass
     assert len(cleared) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.minutes
+def test_many_numbers_of_spheres_stay_below_a_limit_of_memory_maps(monkeypatch):
+    maps = Path("/proc/self/maps")
+    if not maps.exists():
+        pytest.skip("not Linux")
+
+    def num_maps():
+        return len(maps.read_bytes().splitlines())
+
+    # One number of spheres adds some 1100 maps; the limit of Linux would need 40 of them.
+    allowed = num_maps() + 2500
+    limit = int(Path("/proc/sys/vm/max_map_count").read_text())
+    monkeypatch.setattr(tracing, "MAX_MAP_SHARE", allowed / limit)
+    counts = []
+    for number in range(30, 38):
+        curve = cool(times=[0.1 * TAU], model=jaxgran.HardSpheres(number))
+        assert np.isfinite(curve.temperature[0])
+        counts.append(num_maps())
+    print(counts, allowed)
+    assert max(counts) < allowed + 1200  # programs of one number, after the last check
+    assert np.sum(np.diff(counts) < 0) >= 2
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Limits in which simulations of granular gases often fail; experiments/hard_cases.md lists them.
+"""Limits in which simulations of granular gases often fail; a page lists them, hard_cases.md.
 
 Each case returns rows: a name, an error (relative unless the case says otherwise), and the largest
 error allowed, with the reason. Limits that other files test are left out here.

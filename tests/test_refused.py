@@ -146,7 +146,7 @@ SCENES = [
     (lambda: gas_with(temperature=-1.0), "temperature"),
     (lambda: gas_with(dimension=4), "dimension must be 2 or 3, got 4"),
     (lambda: gas_with(law=0.9), "law must be a restitution law"),
-    (lambda: GRAINS.replace(temprature=1.0), "no float 'temprature' in this gas; it has coef"),
+    (lambda: GRAINS.replace(temprature=1.0), "Gas has no parameter 'temprature'; it has coef"),
     (lambda: GRAINS.replace(packing_fraction=0.9), "packing_fraction must lie in"),
     (lambda: GRAINS.delta, "delta belongs to the Viscoelastic law"),
     (lambda: jaxgran.sphere_mass(-1.0, 2500.0), "diameter"),
@@ -227,6 +227,10 @@ CALLS = [
     (lambda: measured(gas=GAS.replace(mass=np.ones(4))), "vmap"),
     (lambda: cool(model=jaxgran.SoftSpheres), "got the class SoftSpheres"),
     (lambda: cool(model=3), "model must be a jaxgran model, got 3"),
+    (
+        lambda: cool(GAS.replace(diameter=1e-300), model=jaxgran.HardSpheres(20)),
+        "diameter 1e-300 m is so small that the volume of a sphere is 0",
+    ),
     (lambda: cool(model=SOFT, key=5), "jax.random.key.5., got 5"),
     (lambda: cool(model=SOFT, checkpoint=5), "checkpoint must be a path"),
     (lambda: cool(times=[1j]), "times must be a list of numbers"),
@@ -256,7 +260,7 @@ CALLS = [
     (lambda: measured(priors=[(PHI, 0.05, 0.01)]), "priors must be a dictionary of names"),
     (
         lambda: measured(priors={"phi": (0.05, 0.01)}),
-        "no float 'phi' in this gas; it has .*, and density",
+        "Gas has no parameter 'phi'; it has .*, and density",
     ),
     (lambda: measured(priors={PHI: 0.05}), r"packing_fraction needs \(value, standard error\)"),
     (lambda: measured(priors={PHI: (0.05, -0.01)}), "error of packing_fraction must lie in"),
@@ -365,7 +369,7 @@ DISAGREE = {
     "b": measured(OTHER_DROPS, priors={"youngs_modulus": (6e7, 1e6)}),
 }
 FITS = [
-    ({"free": "amplitude"}, "no float 'amplitude'"),
+    ({"free": "amplitude"}, "Gas has no parameter 'amplitude'"),
     ({"free": ()}, "free must be a tuple"),
     ({"free": (T_0, T_0)}, "different names"),
     (

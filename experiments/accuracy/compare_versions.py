@@ -18,12 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.support.record import DATA, EXPERIMENTS, Options, of_version, run_parts
+from experiments.support.record import EXPERIMENTS, Options, of_version, run_parts
+from jaxgran.data.example import EXAMPLE_FILES
 
 
 def compare_versions(options: Options) -> Iterator[dict]:
     before, now = (
-        of_version(folder, "numbers", DATA / "lammps_cooling_dilute.csv")
+        of_version(folder, "numbers", EXAMPLE_FILES["dilute"])
         for folder in (options.CHECKOUT, EXPERIMENTS.parent)
     )
     for case in list(now)[1:]:  # the first step is the import

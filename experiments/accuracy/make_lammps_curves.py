@@ -18,7 +18,7 @@ from experiments.support.analysis import mean_and_error
 from experiments.support.lammps_library import granular_box, hertzian, temperature
 from experiments.support.plots import INK, THEORY, caption, panels
 from experiments.support.record import DATA, Options, run_parts
-from experiments.support.scenes import cool, of_lammps
+from experiments.support.scenes import LAMMPS_CURVES, cool, of_lammps
 
 STEPS_PER_CONTACT = 40
 SCENES = ("phi003", "phi003_large", "phi010", "phi025")
@@ -37,8 +37,8 @@ def make_lammps_curves(options: Options) -> dict:
         curve = jaxgran.CoolingCurve(jnp.asarray(times), T, temperature_error=error)
         jaxgran.write_curve(folder / f"lammps_cooling_{name}.csv", curve, header, overwrite=True)
     figure, (axes,) = panels(size=(5.5, 4.0))
-    for k, file in enumerate(sorted(DATA.glob("lammps_cooling_*.csv"))):
-        measurement = of_lammps(file.stem.removeprefix("lammps_cooling_"))
+    for k, name in enumerate(sorted(LAMMPS_CURVES)):
+        measurement = of_lammps(name)
         gas, curve = measurement.gas, measurement.curve
         tau, theory = curve.times[1:] / gas.mean_free_time, cool(gas, curve.times)
         words = f"φ = {float(gas.packing_fraction):g}, N = {measurement.num_particles}"

@@ -12,11 +12,12 @@ import io
 import json
 from functools import partial
 
-from experiments.support.record import DATA, PICTURES, Options, run_parts
+from experiments.support.record import PICTURES, Options, run_parts
+from experiments.support.scenes import LAMMPS_CURVES
 from jaxgran.cli.main import main as command
 
 NAMES = ("dilute", "dense", "phi003", "phi003_large", "phi010", "phi025")
-CURVES = {name: str(DATA / f"lammps_cooling_{name}.csv") for name in NAMES}
+CURVES = {name: str(LAMMPS_CURVES[name]) for name in NAMES}
 SOFT, T_0 = ["--model", "soft-spheres"], ["--free", "A", "T0"]
 CASES = {name: [curve] for name, curve in CURVES.items()} | {
     "dense_T0": [CURVES["dense"], *T_0],

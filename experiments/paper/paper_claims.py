@@ -3,8 +3,9 @@
     python experiments/paper/paper_claims.py [--record] [--out DIR]
 
 Computes constants and formulas in seconds, and reads what the other scripts paper_*.py recorded in
-`experiments/figures`. A verdict is "agree" or "corrected"; it does not hold if the numbers
-contradict it. The table, `templates/paper_claims.md`, quotes these numbers and those figures.
+`experiments/recorded`. A verdict is "agree" or "corrected"; it does not hold if the numbers
+contradict it. The table, `docs/pages/validation/paper_claims.md`, quotes these numbers and
+those figures.
 """
 
 from math import gamma, pi

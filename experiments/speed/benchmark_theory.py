@@ -43,7 +43,6 @@ from scipy.integrate import solve_ivp
 
 import jaxgran
 from experiments.support.record import (
-    DATA,
     EXPERIMENTS,
     Options,
     alternately,
@@ -53,11 +52,12 @@ from experiments.support.record import (
     seconds,
 )
 from experiments.support.scenes import glass
+from jaxgran.data.example import EXAMPLE_FILES
 from jaxgran.scene.geometry import NODES, sphere_surface
 from jaxgran.scene.laws import _CLIPPED, C1
 from jaxgran.theory.averages import averaging_matrix
 
-CURVE = DATA / "lammps_cooling_dilute.csv"
+CURVE = EXAMPLE_FILES["dilute"]
 TASKS = "reference", "fit", "lengths", "command", "SoftSpheres", "HardSpheres", "DSMC"
 RTOL, SCIPY_RTOL = 1e-7, 1e-9  # both give the same accuracy
 REFERENCE = "first Jacobian"
@@ -173,7 +173,7 @@ def benchmark_kinetic_theory(options: Options) -> dict:
 
 def command(folder: Path) -> dict[str, dict[str, float]]:
     """Measure `jaxgran fit` as a process: with an empty cache, with its cache, and without."""
-    main = "from jaxgran_command import main; raise SystemExit(main())"
+    main = "import jaxgran.cli.main as c; raise SystemExit(getattr(c, 'start', c.main)())"
     with tempfile.TemporaryDirectory() as out:
         arguments = ["-c", main, "fit", CURVE, "--free", "A", "T0", "--out", out, "--overwrite"]
         run = partial(process, *arguments, folder=folder, XDG_CACHE_HOME=out)

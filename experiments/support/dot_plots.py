@@ -1,17 +1,19 @@
-"""Pictures of recorded figures: a dot for each row, with its range, and a reference line.
+"""Pictures of recorded results: a dot for each row, with its range, and a reference line.
 
-``python experiments/documents.py --pictures`` draws them all; the entries of the gallery show them.
+``python -m experiments.support.dot_plots`` draws them all; the entries of the gallery show them.
 """
 
 import re
 from collections.abc import Callable, Iterable
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.support.plots import caption
+from experiments.support.record import PICTURES, figures
 from jaxgran.plotting import COLOURS, INK, colour_of
 
 PLOTS: dict[str, tuple[Callable[[dict], Iterable["Dot"]], Callable[..., Figure]]] = {}
@@ -245,3 +247,13 @@ def hard_cases(found: dict) -> Iterable[Dot]:
 
 
 PLOTS["tests/hard_cases"] = PLOTS.pop("hard_cases")
+
+
+def main() -> None:
+    """Draw all pictures."""
+    for name, (dots, draw) in PLOTS.items():
+        draw(dots(figures(name))).savefig(PICTURES / f"{Path(name).name}.png", dpi=110)
+
+
+if __name__ == "__main__":
+    main()

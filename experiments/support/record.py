@@ -1,8 +1,8 @@
 """Run a script by parts, and write its results, its pictures and the figures of the documents.
 
-A script run with ``--record`` writes its results to ``experiments/figures/NAME.json``, with the
-command, the version, the date, the machine and the precision of the run. The documents are
-generated from these files only (``python experiments/documents.py``).
+A script run with ``--record`` writes its results to ``experiments/recorded/NAME.json``, with the
+command, the version, the date, the machine and the precision of the run. Pages of the site take
+their numbers from these files when it is built (``docs/recorded.py``).
 """
 
 import argparse
@@ -29,8 +29,8 @@ from jaxgran.data.files import write_atomically
 
 EXPERIMENTS = Path(__file__).parents[1]
 DATA = EXPERIMENTS / "data"
-PICTURES = EXPERIMENTS / "pictures"
-FIGURES = EXPERIMENTS / "figures"
+PICTURES = EXPERIMENTS.parent / "docs" / "pages" / "figures"
+RECORDED = EXPERIMENTS / "recorded"
 PACKAGES = ("jaxgran", "jax", "jax-md", "diffrax", "optimistix", "numpy", "scipy")
 COUNTS = {1: "one", 2: "two", 4: "four", 8: "eight", 16: "sixteen"}
 BEGAN = time.perf_counter()
@@ -90,7 +90,7 @@ def run_parts(
         pictures = results[part].pop("picture", {})
         pictures = pictures if isinstance(pictures, dict) else {name: pictures}
         pprint.pp(rounded(json.loads(as_json(results[part]))), width=100, compact=True)
-        folders = (options.out, options.out), (FIGURES, PICTURES)
+        folders = (options.out, options.out), (RECORDED, PICTURES)
         for of_figures, of_pictures in folders[: 1 + options.record]:
             save(of_figures / f"{name}.json", **results[part])
             for picture, figure in pictures.items():
@@ -136,7 +136,7 @@ def collected(rows: Iterable[dict]) -> list[dict]:
 
 def figures(name: str, default: Any = None) -> dict[str, Any]:
     """Return the last recorded results of this name; the default if there are none."""
-    path = FIGURES / f"{name}.json"
+    path = RECORDED / f"{name}.json"
     if default is not None and not path.exists():
         return default
     return json.loads(path.read_text(encoding="utf-8"))

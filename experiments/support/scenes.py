@@ -10,6 +10,12 @@ from scipy.optimize import root_scalar
 
 import jaxgran
 from experiments.support.record import DATA
+from jaxgran.data.example import EXAMPLE_FILES
+
+LAMMPS_CURVES = EXAMPLE_FILES | {
+    file.stem.removeprefix("lammps_cooling_"): file for file in DATA.glob("lammps_cooling_*.csv")
+}
+"""Files of curves simulated in LAMMPS, by the name of their scene."""
 
 
 def beads(
@@ -85,7 +91,7 @@ def restitution_like(gas: jaxgran.Gas) -> float:
 
 def of_lammps(name: str) -> jaxgran.Measurement:
     """Return a curve simulated in LAMMPS, with its gas, which has the true A."""
-    return jaxgran.read_measurement(DATA / f"lammps_cooling_{name}.csv")
+    return jaxgran.read_measurement(LAMMPS_CURVES[name])
 
 
 def temperature_only(curve: jaxgran.CoolingCurve) -> jaxgran.CoolingCurve:

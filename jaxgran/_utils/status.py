@@ -121,7 +121,7 @@ def explain(status: ArrayLike | None) -> str:
         status: of one curve or, as `jax.vmap` returns it, of several: `CoolingCurve.status`.
 
     Raises:
-        ValueError: for a number that is no status.
+        ValueError: for a number that is not a status.
 
     >>> jaxgran.explain_status(0)
     'ok'

@@ -1,5 +1,6 @@
 """The command line: `jaxgran fit`, `jaxgran plan`, `jaxgran cool` and `jaxgran choose`."""
 
+import gc
 import os
 import sys
 import time
@@ -32,6 +33,22 @@ APP = App(
 )
 
 
+def start() -> int:
+    """Run `main` as a process of its own: the entry point of the command `jaxgran`.
+
+    Tracing makes many objects that stay. Searching them for garbage seldom, and not at the end,
+    saves 1.3 s of the 6.6 s of processor time that the fit of the README takes.
+
+    Returns:
+        The exit code.
+    """
+    gc.set_threshold(1_000_000)
+    try:
+        return main()
+    finally:
+        gc.freeze()
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command. Invalid input gives one line on stderr and the exit code 2, Ctrl-C 130.
 
@@ -48,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             warnings.simplefilter("always", UserWarning)
             # A damaged cache is compiled again.
             warnings.filterwarnings("ignore", "Error (read|writ)ing persistent compilation cache")
-            warnings.showwarning = lambda text, *_: print(f"check: {text}", file=sys.stderr)
+            warnings.showwarning = lambda text, *_: print(f"warning: {text}", file=sys.stderr)
             APP(words, exit_on_error=False, print_error=False, result_action="return_value")
         sys.stdout.flush()
     except KeyboardInterrupt:
@@ -160,7 +177,7 @@ def cool(
         common.use_compilation_cache()
     picture = out.with_suffix(".png")
     if picture == out:
-        raise ValueError(f"--out {out} is the name of the picture. Give the CSV file another one.")
+        raise ValueError(f"--out must not end in .png, got {out}. The picture is named after it.")
     given = _read_scene(scene, until)
     for file in (out, picture):
         if file.exists() and not overwrite:

@@ -7,8 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import jaxgran
 from jaxgran import plotting
+from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.cli.fit import as_json, parse_settings
 from jaxgran.cli.page import command_of, question_of, sections_of_plan, write_page
 from jaxgran.data.curve import import_extra
@@ -20,6 +23,7 @@ from jaxgran.data.header import (
     priors_of_header,
 )
 from jaxgran.data.scene_file import errors_of, read_scene_file, times_of
+from jaxgran.fitting.twins import twin
 
 
 def run_plan(
@@ -88,18 +92,19 @@ def read_experiment(path: Path) -> jaxgran.Measurement:
     errors = errors_of(experiment)
     if "rotational_temperature" in errors and gas.surface is None:
         raise ValueError("T_rot_err needs rough grains: give beta_t, or leave out T_rot_err")
-    curve = jaxgran.cool(gas, times_of(experiment))
-    planned = {}
+    if "displacement" in errors and gas.container is not None:
+        raise ValueError("displacement is not known in this scene: leave its error out")
+    times = times_of(experiment)
+    ones = np.ones_like(times)
+    planned: dict[str, Any] = {"temperature": ones}
     for name, error in errors.items():
-        values = getattr(curve, name)
-        if values is None:
-            raise ValueError(f"{name} is not known in this scene: leave its error out")
-        planned[f"{name}_error"] = error * values
-    unplanned = {"rotational_temperature", "displacement"} - errors.keys()
-    planned |= dict.fromkeys(unplanned)
-    return jaxgran.Measurement(
+        planned[name] = ones
+        planned[f"{name}_error"] = error * ones
+    planned["status"] = np.zeros((), int)
+    curve = jaxgran.CoolingCurve(times, **as_jax_arrays(planned))
+    measurement = jaxgran.Measurement(
         gas,
-        dataclasses.replace(curve, **planned),
+        curve,
         num_particles=header_count(header, "N"),
         replicas=header_count(header, "replicas") or 1,
         priors=priors_of_header(header),
@@ -108,6 +113,7 @@ def read_experiment(path: Path) -> jaxgran.Measurement:
         errors_measured="temperature" in errors,
         header=tuple(header.items()),
     )
+    return twin(measurement)
 
 
 def details_of(planned: jaxgran.Plan) -> dict[str, Any]:

@@ -114,8 +114,8 @@ def load(path: str | Path, scene: dict[str, str], like: Any) -> Any:
         A pytree like `like` with the saved values.
 
     Raises:
-        ValueError: if the file cannot be read, is no checkpoint, is damaged, or belongs to another
-            version, format or run, naming what differs.
+        ValueError: if the file cannot be read, is not a checkpoint, is damaged, or belongs to
+            another version, format or run, naming what differs.
     """
     try:
         line, _, body = Path(path).read_bytes().partition(b"\n")
@@ -123,7 +123,7 @@ def load(path: str | Path, scene: dict[str, str], like: Any) -> Any:
         old, digest = dict(header["scene"]), header["digest"]
     except (OSError, ValueError, TypeError, LookupError, RecursionError) as error:
         raise ValueError(
-            f"{path} is no checkpoint of jaxgran ({error}). Name another file, or remove it"
+            f"{path} is not a jaxgran checkpoint ({error}). Name another file, or remove it"
         ) from None
     damaged = (
         f"{path} is damaged: its arrays do not match its header. Name another file, or remove it"

@@ -144,7 +144,9 @@ class CoolingCurve(eqx.Module):
         flow_share: share of the kinetic energy in the longest waves of the flow, of spheres in
             periodic boxes: see `jaxgran.observables.flow_share`.
         derivative_bias: share by which a projected derivative of ln T is too large, estimated
-            from flow_share in boxes longer than L_c (`jaxgran.models.error_model`).
+            from flow_share in boxes longer than L_c (`jaxgran.models.error_model`). A change of
+            the shape of the velocity distribution, which matters at a thermal beta above .15, is
+            not part of it: see `jaxgran.DSMC`.
         replicas: the curve of each replica, with arrays of shape (replicas, times).
         particles: the final state of a particle model.
         saved: result of `cool(save=...)` at each time, first axes (times, ...), as the mean over
@@ -412,7 +414,7 @@ def _check_signs(
 
 
 NOISE = 3.0
-"""T over its error below which a row does not count as above the noise."""
+"""T, or <dr^2>, over its error below which a row does not count as above the noise."""
 
 
 def above_noise(curve: CoolingCurve) -> np.ndarray:

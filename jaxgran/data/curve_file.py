@@ -100,7 +100,7 @@ def read_data(path: Path, given: dict[str, str]) -> Content:
     if tracks.is_trajectory(path):
         curve, header = tracks.curve_of_trajectory(path, header_in_si(given))
         return Content(curve, header, list(ask_about_columns(curve, header, gas_or_none(header))))
-    table = read_table(path, WANTED, _columns_to_read, given)
+    table = read_table(path, WANTED, _columns_to_read, given, tracks.IDENTITIES)
     header = table.header
     columns = table.columns
     if is_drop_test(list(columns)):
@@ -109,6 +109,8 @@ def read_data(path: Path, given: dict[str, str]) -> Content:
     if "x" in columns:
         gas = gas_or_none(ANY_MATERIAL | header)
         curve, questions = tracks.curve_of_tracks(columns, header, table.lines, gas)
+        if table.num_left_out:
+            questions.append(f"{table.num_left_out} positions that belong to no track are left out")
         questions += ask_about_columns(curve, header, gas_or_none(header))
         return Content(curve, header, questions)
     columns, rounding, column = _with_temperature(table, header)

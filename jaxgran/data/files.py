@@ -15,7 +15,7 @@ import numpy as np
 
 
 def checked_path(path: Any, kind: str) -> Path:
-    """Return the path of a file; raise ValueError if it is no name of a file."""
+    """Return the path of a file; raise ValueError if it is not the name of a file."""
     if not isinstance(path, str | Path):
         raise ValueError(f"path must be the name of a file, got {path!r:.60}; give {kind}")
     return Path(path)
@@ -35,7 +35,7 @@ def name_in_errors(path: Path) -> Iterator[None]:
     except PermissionError as error:
         raise ValueError(f"{path}: {error.strerror}; check its permissions") from None
     except UnicodeDecodeError:
-        raise ValueError(f"{path}: it is no text file; GSD files end in .gsd") from None
+        raise ValueError(f"{path}: not a text file; GSD files end in .gsd") from None
     except (ValueError, OSError, RuntimeError) as error:
         raise ValueError(f"{path}: {error}") from None
 

@@ -311,7 +311,7 @@ def priors_of_header(header: dict[str, str]) -> dict[str, tuple[float, float]]:
             of t0, the time at which the gas began to cool, is 0 unless the header gives it.
 
     Raises:
-        ValueError: for an error without its value, or one that is no positive number.
+        ValueError: for an error without its value, or one that is not a positive number.
 
     >>> from jaxgran.data.header import priors_of_header
     >>> priors_of_header({"eta": "0.05", "eta_err": "0.002"})

@@ -327,7 +327,7 @@ def checked_priors(gas: Gas, priors: Any) -> Priors:
     for name, pair in priors.items():
         if name not in (DENSITY, START_TIME) and name not in gas.domains:
             raise ValueError(
-                f"priors: no float {name!r} in this gas; it has {', '.join(gas.domains)}, and "
+                f"priors: Gas has no parameter {name!r}; it has {', '.join(gas.domains)}, and "
                 f"{DENSITY} and {START_TIME}"
             )
         if not isinstance(pair, tuple | list) or len(pair) != 2:

@@ -50,7 +50,7 @@ DATA_COLUMNS = {
 """Columns of the section Atoms of a LAMMPS data file, by its atom style."""
 
 POSITIONS = (("xu", "yu", "zu"), ("x", "y", "z"), ("xs", "ys", "zs"), ("xsu", "ysu", "zsu"))
-"""Columns of positions, the first of which that a file has is read; those with s are scaled."""
+"""Accepted names of columns of positions, in order of preference; s stands for scaled ones."""
 VELOCITY = ("vx", "vy", "vz")
 SPIN = ("omegax", "omegay", "omegaz")
 

@@ -38,7 +38,7 @@ def read_scene_file(path: Path) -> tuple[dict[str, str], dict[str, Any]]:
         experiment, {} without one.
 
     Raises:
-        ValueError: for a file that is no TOML, or other tables.
+        ValueError: for a file that is not TOML, or has other tables.
     """
     try:
         values = tomllib.loads(read_text(path, "eta, diameter, ..."))

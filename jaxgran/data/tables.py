@@ -9,7 +9,7 @@ import codecs
 import csv
 import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -67,6 +67,9 @@ ALIASES = {
 
 SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas", "|": "bars", " ": "blanks"}
 
+NO_IDENTITY = ("", "none", "nan")
+"""Cells, in small letters, of a particle that belongs to no track."""
+
 MAX_UNIT = 60
 """Largest number of characters of a unit."""
 
@@ -97,6 +100,7 @@ class Table(NamedTuple):
         cells: the columns as they were written.
         factors: the value in SI of the unit of each column.
         units: the unit that stands behind the name of each column, or "".
+        num_left_out: number of rows that were left out as they have no identity.
     """
 
     header: dict[str, str]
@@ -105,6 +109,7 @@ class Table(NamedTuple):
     cells: dict[str, list[str]]
     factors: dict[str, float]
     units: dict[str, str]
+    num_left_out: int
 
     def last_digits(self, name: str) -> Float[np.ndarray, "rows"]:
         """Return the last digit with which the numbers of a column were written, in SI.
@@ -128,7 +133,7 @@ def read_text(path: Path, columns: str) -> str:
         columns: names of the columns that it should have, for the message.
 
     Raises:
-        ValueError: if the file is empty or is no text.
+        ValueError: if the file is empty or not a text file.
         OSError: if it cannot be read.
     """
     content = read_bytes(path)
@@ -152,6 +157,7 @@ def read_table(
     wanted: str,
     columns_to_read: Callable[[list[str]], Iterable[str]],
     given: dict[str, str],
+    identities: Collection[str],
 ) -> Table:
     """Read header lines, a line of names, and rows of finite numbers.
 
@@ -161,6 +167,8 @@ def read_table(
         columns_to_read: from the names of the columns without units, those whose numbers are read;
             raises ValueError for wrong names.
         given: entries of the header, with or without units, that replace those of the file.
+        identities: names of columns that identify particles: rows without a number there, as of
+            particles that belong to no track, are left out.
 
     Raises:
         ValueError: saying what is wrong, in which line, and what to do.
@@ -198,6 +206,9 @@ def read_table(
         raise ValueError(f"line {first}: {error}") from None
     factors = [_factor(name, dict(told), units, "column") for name in bare_names]
     at = [bare_names.index(name) for name in chosen]
+    without = _pop_rows_without_identity(
+        rows, [k for k in at if bare_names[k] in identities], len(names)
+    )
     comma = _decimal_comma(rows, at, separator)
     values = []
     for i, row in rows.items():
@@ -226,7 +237,20 @@ def read_table(
         {name: [row[k] for row in rows.values()] for name, k in zip(chosen, at, strict=True)},
         {name: factors[k] for name, k in zip(chosen, at, strict=True)},
         {name: dict(told)[name] for name in chosen},
+        without,
     )
+
+
+def _pop_rows_without_identity(rows: dict[int, list[str]], at: list[int], length: int) -> int:
+    """Remove rows of `length` cells with no number in the columns `at`; return how many."""
+    without = [
+        i
+        for i, row in rows.items()
+        if len(row) == length and any(row[k].lower() in NO_IDENTITY for k in at)
+    ]
+    for i in without:
+        rows.pop(i)
+    return len(without)
 
 
 def _places(cell: str) -> tuple[int, int]:
@@ -511,7 +535,7 @@ def _factor(name: str, told: dict[str, str], units: dict[str, str], kind: str) -
         return 1.0
     try:
         return unit_in(unit, base)
-    except Exception:  # pint raises errors of many types for text that is no unit
+    except Exception:  # pint raises errors of many types for text that is not a unit
         advice = f"write a unit such as {base}, or leave it out"
         if base == "m^2/s^2":
             advice = "T is <v^2>/d, in m^2/s^2: multiply kelvin by 1.38e-23 J/K over the mass"
@@ -532,7 +556,7 @@ def unit_in(unit: str, base: str) -> float:
         raise ValueError("units have powers of one digit")
     parsed = _units().parse_units(text)
     if "pixel" in str(parsed):  # which pint takes for 1/96 inch
-        raise ValueError("a pixel is no length")
+        raise ValueError("a pixel is not a length")
     factor = _units().Quantity(1.0, parsed).to("" if base == "1" else base).magnitude
     return float(f"{factor:.15g}")  # without the rounding errors of several factors
 

@@ -174,7 +174,7 @@ def read_impacts(path: str | Path, header: dict[str, Any] | None = None) -> Impa
                 "impacts are read from CSV files of tracks (id,t,x,y,z), frame by frame; a file of "
                 "velocities at few times does not show them"
             )
-        table = read_table(path, "id,t,x,y,z", tracks.track_columns, given)
+        table = read_table(path, "id,t,x,y,z", tracks.track_columns, given, tracks.IDENTITIES)
         entries = header_in_si(table.header)
         gas, _ = gas_of_header(entries)
         motion = _Motion.of_columns(table.columns, entries, table.lines, gas)

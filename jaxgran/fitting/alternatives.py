@@ -133,7 +133,7 @@ class Kind(NamedTuple):
         rate_error: relative error of kinetic theory's cooling rate by it, at an amplitude.
         one_minimum: False if amplitudes beyond excluded ones may be allowed.
         changes_law: whether it is in the law of impacts, which drop tests obey, too.
-        keeps_A: False if A has no meaning in it: it is no part of the range.
+        keeps_A: False if A has no meaning in it: it is not part of the range.
     """
 
     name: str
@@ -182,7 +182,7 @@ class Alternative(NamedTuple):
         error_reduction_needed: factor by which the errors must decrease for that; 1 if it is
             distinguishable.
         restitution: eps of an alternative in which it is constant, so that A has no meaning; None
-            for all others. It is no part of the range.
+            for all others. It is not part of the range.
 
     >>> best = result.alternatives[0]
     >>> best.improvement < 0.01 and not best.preferred  # the curve has no noise
@@ -310,7 +310,7 @@ class _Summary(NamedTuple):
             fine = np.linspace(0, len(trials) - 1, 40 * (len(trials) - 1) + 1)
             known = np.arange(len(trials))
             rows.append(np.stack([np.interp(fine, known, column) for column in values.T], axis=1))
-        # The law without an alternative is no trial of one that has no amplitudes in between.
+        # The law without an alternative is not a trial of one that has no amplitudes in between.
         ends = [trials if kind is None or kind.keeps_A else trials[1:] for trials in profiles]
         best = min((t for trials in ends for t in trials), key=lambda t: t.value, default=self.base)
         values = np.concatenate(rows)

@@ -24,7 +24,7 @@ from jaxgran.fitting.parameters import (
     with_names_of_law,
 )
 from jaxgran.fitting.result import Fit
-from jaxgran.fitting.rows import unused_rotation
+from jaxgran.fitting.rows import unused_displacements, unused_rotation
 from jaxgran.fitting.search import Descent, is_transformation
 from jaxgran.fitting.setup import Request
 from jaxgran.fitting.simulations import MAX_LINEARISED, fit_through_simulations
@@ -142,8 +142,9 @@ def fit(
         smooth = {SMOOTHNESS: (jnp.asarray(0.0), jnp.asarray(1.0))}
         priors[SHARED] = priors.get(SHARED, {}) | smooth
     for m in curves.values():
-        if unused := unused_rotation(m):
-            warnings.warn(unused, stacklevel=2)
+        for unused in (unused_rotation(m), unused_displacements(m)):
+            if unused is not None:
+                warnings.warn(unused, stacklevel=2)
     shared = priors.get(SHARED, {})
     _check_model(model, solver, (*names, *separate), shared, gas, curves)
     known = {name for some in priors.values() for name in some}

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran._utils.tracing import grid_size
 from jaxgran._utils.validation import float_array
-from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.curve import NOISE, CoolingCurve
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import Measurement
 from jaxgran.fitting.parameters import with_floats
@@ -411,7 +411,11 @@ def _errors_of_measurement(
 
 
 def _displacement(measurement: Measurement, model: AbstractModel) -> Displacement | None:
-    """Return <dr^2> if it was measured with errors, or of N grains, and the model knows it."""
+    """Return <dr^2> if it was measured with errors, or of N grains, and the model knows it.
+
+    ln <dr^2> is compared. If a value is below 0, as after noise was subtracted, only values more
+    than `NOISE` errors above 0 count.
+    """
     curve = measurement.curve
     gas = measurement.gas
     N = measurement.num_particles
@@ -428,8 +432,26 @@ def _displacement(measurement: Measurement, model: AbstractModel) -> Displacemen
     else:
         relative = np.asarray(curve.displacement_error) / np.maximum(values, TINY)
     used = (values > 0) & (relative > 0)
+    if np.any(values < 0):
+        used &= NOISE * relative < 1
     errors = np.where(used, np.hypot(relative, float(accuracy)), 0.0)
     return Displacement(values, errors, float(accuracy))
+
+
+def unused_displacements(measurement: Measurement) -> str | None:
+    """Return which <dr^2> of a curve a fit ignores; None unless some of them are below 0."""
+    curve = measurement.curve
+    if curve.displacement is None or curve.displacement_error is None:
+        return None
+    values = np.asarray(curve.displacement)
+    error = np.asarray(curve.displacement_error)
+    if not np.any(values < 0):
+        return None
+    number = int(np.sum((values <= NOISE * error) & (error > 0)))
+    return (
+        f"<dr^2> is below 0 within its error: its logarithm is compared, and {number} of "
+        f"{values.size} values, less than {NOISE:g} errors above 0, are not used"
+    )
 
 
 def unused_rotation(measurement: Measurement) -> str | None:

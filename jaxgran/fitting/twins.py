@@ -170,7 +170,9 @@ def twin(measurement: Measurement, truth: Truth = AS_GIVEN) -> Measurement:
     elapsed = np.maximum(np.asarray(data.times) - t0, 0.0) * faster
     times, place = times_with_nodes(elapsed, float(gas.mean_free_time))
     model = KineticTheory()
-    curve = curve_of_program(model, gas, times, data.displacement is not None)
+    # The program of the fit, whose alternatives have Gaussian spins where its spheres are smooth.
+    of_fit = model.simplified_for(measurement.gas)
+    curve = curve_of_program(of_fit, gas, times)
     if data.displacement is not None:
         curve = model.simulate(gas, as_jax_arrays(times))
     fields: dict[str, Any] = {}

@@ -358,6 +358,11 @@ def check_packing(gas: Gas, num_particles: int, random: bool) -> None:
             "allowed. Lower it, or give your own start."
         )
     side = float(jnp.min(gas.box_side(num_particles) / gas.diameter))
+    if side == 0:
+        raise ValueError(
+            f"diameter {float(jnp.min(gas.diameter)):g} m is so small that the volume of a sphere "
+            f"is 0 in {gas.diameter.dtype}. Check its unit."
+        )
     if side < MIN_BOX:
         raise ValueError(
             f"the box is {side:.3g} diameters long, at least {MIN_BOX} are needed to distinguish "

@@ -133,7 +133,7 @@ class KineticTheory(AbstractModel):
             raise ValueError(
                 f"order must be 2 or 3, got {self.order!r}. Use sonine=False for a Maxwellian gas."
             )
-        advice = "It is that of the velocities at t = 0, and 0 for a Maxwellian gas."
+        advice = "Initial a_2; 0 for a Maxwellian."
         validation.checked_float("initial_sonine", self.initial_sonine, SONINES, advice)
         if self.initial_sonine and not self.sonine:
             raise ValueError(

@@ -214,7 +214,7 @@ class AbstractSpheres(AbstractParticleModel):
         choose_engine(self.neighbours)
         if self.differences is None:
             return
-        advice = "In the logarithm of an impact's loss: 0.3, or None for projected derivatives."
+        advice = "Step in ln(loss), typically 0.3; None for projected derivatives."
         checked_float("differences", self.differences, DIFFERENCE_STEPS, advice)
         if not self.projected:
             raise ValueError(

@@ -66,7 +66,7 @@ class Capacity(NamedTuple):
 
     def exceeded_by(self, needed: Int[Array, "kinds"]) -> Int[Array, ""]:
         """Return the status of a run that needs these numbers of rows."""
-        full = needed > jnp.array(self)
+        full = needed > jnp.array(self, needed.dtype)
         in_list = status.flag(status.LIST_FULL, jnp.any(full[:2]))
         return in_list | status.flag(status.CONTACTS_FULL, jnp.any(full[2:]))
 

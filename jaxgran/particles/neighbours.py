@@ -33,9 +33,10 @@ def rows_where(mask: Bool[Array, "all"], size: int) -> tuple[Int[Array, "{size}"
     """
     num_words = -(-mask.size // 32)
     bits = jnp.pad(mask, (0, 32 * num_words - mask.size)).reshape(num_words, 32)
-    words = jnp.sum(bits << jnp.arange(32, dtype=jnp.uint32)[None], axis=1, dtype=jnp.uint32)
+    places = jnp.arange(32, dtype=jnp.uint32)[None]
+    words = jnp.sum(bits.astype(jnp.uint32) << places, axis=1, dtype=jnp.uint32)
     word, bit, count = bits_where(words, size)
-    return jnp.where(jnp.arange(size) < count, 32 * word + bit, mask.size), count
+    return jnp.where(jnp.arange(size, dtype=jnp.int32) < count, 32 * word + bit, mask.size), count
 
 
 def select_members(
@@ -59,7 +60,7 @@ def select_members(
     """
     n = len(others)
     rows, num_rows = rows_where(selected, capacity[0])
-    real = jnp.arange(capacity[0]) < num_rows
+    real = jnp.arange(capacity[0], dtype=jnp.int32) < num_rows
     rows = jnp.where(real, rows, 0)
     ends = jnp.stack([i[rows], j[rows]])
     is_member = others.at[jnp.where(real[None], ends, n)].set(True, mode="drop")
@@ -216,7 +217,7 @@ def sweep(
     there = index - first + _WORD * (word // (replicas * n)) + bit + 1
     there = first + jnp.where(there >= n, there - n, there)
     particle = (order + n * jnp.arange(replicas, dtype=jnp.int32)[:, None]).ravel()
-    in_use = jnp.arange(capacity) < count
+    in_use = jnp.arange(capacity, dtype=jnp.int32) < count
     i, j = (jnp.where(in_use, particle.at[k].get(mode="clip"), 0) for k in (index, there))
     return jnp.minimum(i, j), jnp.maximum(i, j), count, jnp.minimum(_WORD * blocks, n - 1)
 
@@ -390,7 +391,8 @@ def _jax_md_pairs(position, side, cutoff, replicas: int, capacity: int):
     boxes = position.reshape(replicas, -1, position.shape[-1])
     multiplier = 1.5
     max_multiplier = 100.0
-    with jax.numpy_rank_promotion("allow"):  # jax-md needs it
+    # jax-md needs both.
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
         while True:
             allocated, update = _jax_md_list(boxes.shape, float(side), float(cutoff), multiplier)
             lists = update(boxes, allocated(boxes[0]))
@@ -437,6 +439,6 @@ def _flatten(index: Int[Array, "replicas 2 most"], num_particles: int, capacity:
     is_pair = jnp.ravel(index[:, 0] < num_particles)
     (rows,) = jnp.nonzero(is_pair, size=capacity, fill_value=0)
     count = jnp.sum(is_pair, dtype=jnp.int32)
-    in_use = jnp.arange(capacity) < count
+    in_use = jnp.arange(capacity, dtype=jnp.int32) < count
     i, j = (jnp.where(in_use, jnp.ravel(index[:, k] + first)[rows], 0) for k in (0, 1))
     return i.astype(jnp.int32), j.astype(jnp.int32), count

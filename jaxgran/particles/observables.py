@@ -412,7 +412,8 @@ def _amplitudes(
     unit = jnp.asarray(position) / jnp.asarray(side)
     # Whole periods do not change the result, and a small phase is rounded less.
     phase = 2 * jnp.pi * ((unit - jnp.floor(unit)) @ waves.T.astype(unit.dtype))
-    return weights @ jnp.exp(1j * phase) / math.sqrt(len(position))
+    factors = jnp.exp(jax.lax.complex(jnp.zeros_like(phase), phase))
+    return weights.astype(factors.dtype) @ factors / math.sqrt(len(position))
 
 
 def _wave_numbers(waves: np.ndarray, shells: list[np.ndarray], side: ArrayLike) -> Array:

@@ -78,7 +78,7 @@ def saved(save: Callable[[Particles], Any], particles: Particles) -> Any:
     def of_replica(replica: Particles) -> Any:
         tree = save(replica)
         if not jax.tree.leaves(tree):
-            raise ValueError(f"save must return arrays, in any tree, got {tree!r:.60} from it")
+            raise ValueError(f"save must return a pytree of arrays, got {tree!r:.60}")
         return jax.tree.map(_as_array, tree)
 
     axes: Any = jax.tree.map(lambda _: 0, particles)._replace(box_side=None)

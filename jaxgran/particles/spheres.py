@@ -454,10 +454,11 @@ def common_values(
         "sonine": observables.sonine(velocity),
         "velocity_correlation": observables.velocity_correlation(first, velocity),
         "dissipated_energy": state.dissipated / num_particles,
-        "collisions": 2 / num_particles * state.collisions,
+        "collisions": 2 / num_particles * state.collisions.astype(jnp.result_type(float)),
     }
     if scene.container is None:
-        travelled = centred(state.position - state.origin + scene.side * state.image, replicas)
+        boxes = state.image.astype(state.position.dtype)
+        travelled = centred(state.position - state.origin + scene.side * boxes, replicas)
         flow_share = jax.vmap(partial(observables.flow_share, side=scene.side))
         values["displacement"] = observables.mean_square_displacement(travelled)
         values["flow_share"] = flow_share(state.position.reshape(velocity.shape), velocity)

@@ -175,7 +175,7 @@ class Placement(AbstractProcess):
         pairs = neighbours.with_offsets(built, side, listed)
         needed = jnp.zeros_like(state.needed).at[:2].set(jnp.stack([pairs.count, pairs.lookahead]))
         full = self.capacity.exceeded_by(needed)
-        in_use = jnp.arange(max_pairs) < pairs.count
+        in_use = jnp.arange(max_pairs, dtype=jnp.int32) < pairs.count
         volume = side**dimension if self.region is None else jnp.prod(self.region + 1)
         per_sphere = sphere_surface(dimension) / dimension / 2**dimension
         packing_fraction = num_particles * per_sphere / volume
@@ -196,7 +196,8 @@ class Placement(AbstractProcess):
             first_axis = jnp.zeros_like(separation).at[:, 0].set(COINCIDENT)
             separation = jnp.where((square > 0)[:, None], separation, first_axis)
             close = in_use & (distance < 1 + GAP / 2)
-            share = state.share[pairs.i] + state.share[pairs.j] + GOLDEN_RATIO * state.num_pushes
+            shift = GOLDEN_RATIO * state.num_pushes.astype(x.dtype)
+            share = state.share[pairs.i] + state.share[pairs.j] + shift
             target = 1 + GAP + extra_gap * (share - jnp.floor(share))
             size = jnp.where(close, 0.5 * (target - distance) / distance, 0.0)
             push = size[:, None] * separation

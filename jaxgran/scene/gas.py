@@ -235,7 +235,7 @@ class Gas(eqx.Module):
         """
         fields = self._float_fields
         if name not in fields:
-            raise ValueError(f"no float {name!r} in this gas; it has {', '.join(fields)}")
+            raise ValueError(f"Gas has no parameter {name!r}; it has {', '.join(fields)}")
         return fields[name].get(self)
 
     def replace(self, **values: UserNumber) -> "Gas":

@@ -65,7 +65,7 @@ class RestitutionLaw(eqx.Module):
     """Names of the fields that hold more than one number."""
 
     constants: ClassVar[tuple[str, ...]] = ()
-    """Names of the arrays that are no floats of a gas: fits and sweeps leave them as they are."""
+    """Array fields that are not parameters: fits and sweeps leave them as they are."""
 
     advice: ClassVar[dict[str, str]] = {}
     """Advice on a value outside its range, by name: a sentence that ends the error message."""

@@ -80,7 +80,7 @@ def test_other_runs_are_refused(finished, path):
 def test_damaged_files_are_told_or_harmless(finished, path):
     curve, data = finished
     for part in (0.0, 0.001, 0.3, 0.9, 0.999):
-        words = "run.eqx is (damaged|no checkpoint of jaxgran)"
+        words = "run.eqx is (damaged|not a jaxgran checkpoint)"
         assert_refused(path, data[: int(part * len(data))], words)
     rng, told = np.random.default_rng(0), 0
     for end in 50 * [data.index(b"\n"), len(data)]:  # half of them in the header
@@ -103,7 +103,7 @@ def test_files_of_others_are_refused(path):
     headers = (b"3", b"[]", b"{}", b'{"format": 2}', b"[" * 100_000)
     contents = (b"t,T\n0,1\n", b"\x89PNG\r\n\x1a\n", b"\x00" * 100, archive.getvalue())
     for content in (*contents, *(header + b"\n" for header in headers)):
-        assert_refused(path, content, "run.eqx is no checkpoint")
+        assert_refused(path, content, "run.eqx is not a jaxgran checkpoint")
 
 
 def test_nothing_is_unpickled(finished, path):

@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxgran
-from experiments.support.record import DATA
 from jaxgran.data.header import gas_of_header, priors_of_header
 from tests.beads import glass_beads
 
@@ -19,13 +18,18 @@ ROWS = "t,T,T_err\n0,0.01,0\n1,0.005,1e-3\n2,0.003,1e-3\n3,0.002,1e-3\n"
 
 
 def test_measured_curves_are_read():
-    measurement = jaxgran.read_measurement(DATA / "lammps_cooling_dilute.csv")
+    measurement = jaxgran.example_measurement()
     curve, gas = measurement.curve, measurement.gas
     assert curve.times.shape == curve.temperature.shape == curve.displacement.shape == (61,)  # pyright: ignore
     assert measurement.num_particles == 4000
     assert float(gas.packing_fraction) == 0.05
     assert float(gas.dissipative_constant) == 3e-6
     np.testing.assert_allclose(gas.mass, np.pi / 6 * 2500 * 8e-9)
+
+
+def test_an_unknown_example_is_refused_with_the_known_ones():
+    with pytest.raises(ValueError, match='name must be "dilute" or "dense", got \'granular\''):
+        jaxgran.example_measurement("granular")
 
 
 def test_everything_that_was_computed_is_kept(tmp_path):

@@ -395,3 +395,17 @@ def test_tracks_as_trackmate_exports_them(read, d):
     curve, found = read(head, *arrays)
     np.testing.assert_allclose(np.mean(curve.temperature / T), 1.0, atol=0.1)
     assert ("two of three coordinates" in found["T_from"]) == (d == 2)
+
+
+@pytest.mark.parametrize("nothing", ["", "None", "nan"])
+def test_positions_without_a_track_are_left_out(tmp_path, nothing):
+    columns, T, _ = tracks(d=3)
+    ids, t, x, y, z = columns[:5]
+    rows = [",".join(map(repr, map(float, row))) for row in zip(ids, t, x, y, z, strict=True)]
+    rows += [f"{nothing},{float(t[k])!r},0.001,0.002,0.003" for k in range(0, len(ids), 9)]
+    head = "TRACK_ID,POSITION_T,POSITION_X,POSITION_Y,POSITION_Z"
+    path = write(tmp_path / "spots.csv", "\n".join([head, *rows]) + "\n")
+    number = len(rows) - len(ids)
+    with pytest.warns(UserWarning, match=f"{number} positions that belong to no track are left"):
+        curve = jaxgran.read_curve(path)[0]
+    np.testing.assert_allclose(np.mean(curve.temperature / T), 1.0, atol=0.1)

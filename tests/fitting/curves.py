@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 import jaxgran
-from experiments.support.record import DATA
+from experiments.support.scenes import of_lammps
 from tests.beads import glass_beads
 
 A = "dissipative_constant"
@@ -50,7 +50,7 @@ def rough_beads(tangential_restitution=0.0):
 
 def measured(name):
     """A curve measured in LAMMPS, with its gas."""
-    return jaxgran.read_measurement(DATA / f"lammps_cooling_{name}.csv")
+    return of_lammps(name)
 
 
 def fitted(gas, curve, free=(A,), **options):

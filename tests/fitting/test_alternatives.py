@@ -82,6 +82,21 @@ def test_every_model_has_limitations_in_a_dense_scene():
     assert hard == dsmc[:2] and soft == ()
 
 
+def test_a_crystal_is_beyond_models_without_positions():
+    gas = glass_beads(0.09, packing_fraction=0.64)
+    for model in (jaxgran.KineticTheory(), jaxgran.DSMC(100)):
+        decisive = [x.words for x in model.limitations(gas, None) if x.decisive]
+        assert any("0.64 is above 0.545, where spheres form a crystal" in x for x in decisive)
+
+
+def test_gravity_is_said_to_be_taken_as_absent_between_walls():
+    between = dataclasses.replace(glass_beads(0.1), container=jaxgran.Walls(0.1, restitution=0.8))
+    for gas in (glass_beads(0.1), between):
+        result = fitted(gas, synthetic(gas), quick=True)
+        found = any("gravity is taken as absent" in reason for reason in result.reasons)
+        assert found == (gas is between)
+
+
 EDGE = jaxgran.Limitation("the gas is dense", False, "Take positions.")
 DECISIVE = jaxgran.Limitation("contacts last", True, "Take contacts.")
 CONSISTENT = " is consistent with this curve"

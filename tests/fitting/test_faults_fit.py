@@ -92,6 +92,28 @@ def test_no_alternatives_of_a_curve_in_other_units():
         assert "check the units, the scale of T and T0" in str(fit.reasons)
 
 
+def test_displacements_below_zero_are_left_out_and_counted():
+    times = np.geomspace(0.1, 100, 30) * float(GAS.mean_free_time)
+    exact = jaxgran.cool(GAS, times)
+    T, displacement = np.asarray(exact.temperature), np.asarray(exact.displacement)
+    error = np.hypot(0.02 * displacement, displacement[10])
+    measured = displacement + error * np.random.default_rng(1).normal(size=30)
+    assert np.any(measured < 0)
+    curve = jaxgran.CoolingCurve(
+        times,
+        T,
+        temperature_error=0.01 * T,
+        displacement=measured,
+        displacement_error=error,
+    )
+    number = np.sum(measured < 3 * error)
+    with pytest.warns(UserWarning, match=f"below 0 .* {number} of 30 values"):
+        fit = fitted(GAS, curve, quick=True)
+    assert np.sum(fit.residuals[""]["displacement"] == 0) == number
+    value, error_of_A = fit.value(A)
+    assert abs(value - GAS.value(A)) < 3 * error_of_A
+
+
 @pytest.mark.filterwarnings("ignore:this curve does not determine")
 def test_a_curve_that_rises_is_not_explained_by_scatter():
     curve = jaxgran.CoolingCurve([1.0, 2.0, 3.0, 4.0], [0.01, 0.011, 0.012, 0.013])

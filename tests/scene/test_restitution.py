@@ -18,7 +18,7 @@ C1, C2 = 1.153448858095289, 0.798266560944795
 
 @pytest.mark.parametrize("beta, unclipped, clipped, _", REFERENCE)
 def test_fast_law_matches_the_impact(beta, unclipped, clipped, _):
-    # Documented: 1e-9 clipped and 1e-7 unclipped; between these, experiments/figures.
+    # Documented: 1e-9 clipped and 1e-7 unclipped; between these, experiments/recorded.
     np.testing.assert_allclose(viscoelastic_restitution(beta), clipped, rtol=1e-9)
     fast = viscoelastic_restitution(beta, clipped=False)
     np.testing.assert_allclose(fast, unclipped, rtol=1e-7)

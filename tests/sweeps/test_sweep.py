@@ -248,7 +248,7 @@ TWO_LENGTHS = GAS.replace(temperature=jnp.ones(3), diameter=jnp.ones(2))
         ({"gases": GAS.replace(temperature=jnp.ones((2, 2)))}, r"has shape \(2, 2\).*ravel"),
         ({"gases": dense(2.0, 3.0)}, "supports no member .*; member 0: packing_fraction"),
         ({"save": lambda p: {"a.b": p.velocity}, "model": DSMC}, "the key 'a.b': keys name arrays"),
-        ({"save": lambda p: None, "model": DSMC}, "must return arrays, in any tree, got None"),
+        ({"save": lambda p: None, "model": DSMC}, "must return a pytree of arrays, got None"),
         ({"save": lambda p: "words", "model": DSMC}, "must return numbers, got 'words'"),
     ],
 )

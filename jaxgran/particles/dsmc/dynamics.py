@@ -457,7 +457,7 @@ class DSMCDynamics(AbstractDynamics):
         growth = self.kick_growth(clock, dt, float(place))
         key = jax.random.fold_in(key, 2 + place)
         at_rest = self.scene.walls is None
-        size = jnp.sqrt(growth / 2 * (parts / kicked))
+        size = jnp.sqrt(growth / 2 * (parts / kicked).astype(growth.dtype))
         time = gas.clock
 
         def kick(i: Array, rows: Array, belongs: Array) -> tuple[Array, Array]:
@@ -537,14 +537,15 @@ class DSMCDynamics(AbstractDynamics):
         d = self.scheme.dimension
         middle = gas.clock + dt / 2
         axis = (gas.steps % d).astype(jnp.int32)
-        across = (jnp.arange(d) == axis).astype(particles.dtype)[None]
+        across = (jnp.arange(d, dtype=jnp.int32) == axis).astype(particles.dtype)[None]
         key = jax.random.fold_in(key, 1)
         (drawn, largest) = counts
         parts = num_subsets(len(particles))
 
         def hit_rows(i: Array, rows: Array, belongs: Array) -> tuple[Array, EnergyGains]:
             bits = jax.random.bits(jax.random.fold_in(key, i), belongs.shape, jnp.uint16)
-            chance = (bits.astype(particles.dtype) + 0.5) * 2.0**-16 * (drawn / parts)
+            share = (drawn / parts).astype(particles.dtype)
+            chance = (bits.astype(particles.dtype) + 0.5) * 2.0**-16 * share
             chance = jnp.where(belongs, chance, jnp.inf)
 
             def of_scene(

@@ -59,7 +59,7 @@ The length changes by ``(wanted / executed impacts)^0.3``, as the number of impa
 SPEED_MARGIN = 1.15
 """Bound on the speeds within a window, over the speed of the fastest sphere before it."""
 
-MAX_LISTED_PER_PARTICLE = 20.0
+MAX_LISTED_PER_PARTICLE = 20
 """Listed pairs per particle from which on the skin is shortened, as in dense clusters."""
 
 MIN_SKIN = 0.2
@@ -200,7 +200,7 @@ class HardDynamics(AbstractSphereDynamics):
         container = self.scene.container
         separation = x[pairs.i] - x[pairs.j] - pairs.offset
         square = jnp.sum(separation * separation, -1)
-        in_use = jnp.arange(len(square)) < pairs.count
+        in_use = jnp.arange(len(square), dtype=jnp.int32) < pairs.count
         closest = jnp.sqrt(jnp.min(jnp.where(in_use, square, 1.0), initial=1.0))
         if container is not None:  # a sphere and its image beyond a wall
             closest = jnp.minimum(closest, 2 * jnp.min(jnp.minimum(x, container[None] - x)))
@@ -269,9 +269,9 @@ class HardDynamics(AbstractSphereDynamics):
         # The listed pairs that can touch at the largest speeds are a small part of the list.
         displacement = x[pairs.i] - x[pairs.j] - pairs.offset
         gap = jnp.sqrt(jnp.sum(displacement * displacement, -1)) - 1
-        gap = jnp.where(jnp.arange(gap.size) < pairs.count, gap, jnp.inf)
+        gap = jnp.where(jnp.arange(gap.size, dtype=jnp.int32) < pairs.count, gap, jnp.inf)
         near, num_near = rows_where(gap < 2 * bound[pairs.i // size] * duration, self.capacity.near)
-        real = jnp.arange(self.capacity.near) < num_near
+        real = jnp.arange(self.capacity.near, dtype=jnp.int32) < num_near
         near = jnp.where(real, near, 0)
         i = pairs.i[near]
         j = pairs.j[near]
@@ -304,13 +304,14 @@ class HardDynamics(AbstractSphereDynamics):
         impacts = by_replica(work.impacts) // 2
         lost = by_replica(work.dissipated)
         wanted = max(0.5 * self.share * len(state.position), MIN_IMPACTS)
-        num_impacts = jnp.sum(impacts)
+        num_impacts = jnp.sum(impacts).astype(lost.dtype)
         if work.wall_impacts is not None:  # each of one sphere, not of two
-            num_impacts = num_impacts + jnp.sum(work.wall_impacts) / 2
+            num_impacts = num_impacts + jnp.sum(work.wall_impacts).astype(lost.dtype) / 2
         ratio = jnp.clip((wanted / jnp.maximum(num_impacts, 1)) ** WINDOW_EXPONENT, 0.5, 1.5)
         paths = work.paths
         internal = state.internal
-        regularised = internal.regularised + by_replica(work.regularised) // 2
+        more = by_replica(work.regularised).astype(internal.regularised.dtype) // 2
+        regularised = internal.regularised + more
         rotational_gain = None
         if work.rotational_gain is not None:
             rotational_gain = internal.rotational_gain + by_replica(work.rotational_gain)
@@ -322,7 +323,7 @@ class HardDynamics(AbstractSphereDynamics):
             ),
             velocity=to_members(state.velocity, paths.v),
             dissipated=state.dissipated + lost,
-            collisions=state.collisions + impacts,
+            collisions=state.collisions + impacts.astype(state.collisions.dtype),
             internal=internal._replace(
                 age=to_members(internal.age + duration, duration - paths.last),
                 regularised=regularised,
@@ -461,7 +462,8 @@ def hard_records(state: SphereState, scene: SphereScene, replicas: int) -> Recor
     material = scene.material
     tangents = state.tangents
     (n, d) = velocity.shape[1:]
-    values["regularised"] = 2 / n * state.internal.regularised
+    regularised = state.internal.regularised.astype(jnp.result_type(float))
+    values["regularised"] = 2 / n * regularised
     if material.has_elements:
         values |= _values_with_elements(state, scene, values)
     if tangents is None:

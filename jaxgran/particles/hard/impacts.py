@@ -275,9 +275,9 @@ def execute_impacts(
         s = jnp.where(hit, s[row], 0.0)
         too_soon = too_soon[row]
         x = paths.x - effect.kick * s[:, None]
-        impacts = work.impacts + hit
+        impacts = work.impacts + hit.astype(jnp.int32)
         wall_impacts = work.wall_impacts
-        regularised = work.regularised + (hit & too_soon)
+        regularised = work.regularised + (hit & too_soon).astype(jnp.int32)
         wall_times = next_impacts.wall_times
         axis = next_impacts.wall_axis
         if wall_times is not None and axis is not None and wall_impacts is not None:
@@ -301,9 +301,9 @@ def execute_impacts(
             hit = hit | at_wall
             after = paths.x + paths.v * s[:, None] - (paths.v + effect.kick) * s[:, None]
             x = _where_rows(at_wall, after, x)
-            wall_impacts = wall_impacts + at_wall
+            wall_impacts = wall_impacts + at_wall.astype(jnp.int32)
             # An impact of two spheres counts twice.
-            regularised = regularised + 2 * (at_wall & too_soon)
+            regularised = regularised + 2 * (at_wall & too_soon).astype(jnp.int32)
 
         v = paths.v + effect.kick
         spin = paths.spin

@@ -204,7 +204,7 @@ class SoftDynamics(AbstractSphereDynamics):
         x = state.position
         material = self.scene.material
         xi, _, touching = overlap(x, pairs.i, pairs.j, pairs.offset)
-        touching &= jnp.arange(len(xi)) < pairs.count
+        touching &= jnp.arange(len(xi), dtype=jnp.int32) < pairs.count
         stored = elastic_energy(jnp.where(touching, xi, 0.0), material.law, PAIR)
         replica = pairs.i // (len(x) // self.replicas)
         elastic = jnp.zeros_like(state.internal.elastic).at[replica].add(stored)
@@ -298,9 +298,9 @@ class SoftDynamics(AbstractSphereDynamics):
         max_near = self.capacity.near
         displacement = position[pairs.i] - position[pairs.j] - pairs.offset
         near = jnp.sum(displacement * displacement, -1) < (1 + margin) ** 2
-        near &= jnp.arange(near.size) < pairs.count
+        near &= jnp.arange(near.size, dtype=jnp.int32) < pairs.count
         rows, num_near = rows_where(near, max_near)
-        real = jnp.arange(max_near) < num_near
+        real = jnp.arange(max_near, dtype=jnp.int32) < num_near
         i = pairs.i[rows]
         j = pairs.j[rows]
         offset = pairs.offset[rows]
@@ -455,7 +455,7 @@ class SoftDynamics(AbstractSphereDynamics):
             position=x,
             velocity=v,
             dissipated=state.dissipated + lost_with_drag,
-            collisions=state.collisions + begun,
+            collisions=state.collisions + begun.astype(state.collisions.dtype),
             internal=state.internal._replace(elastic=stored, spin=spin),
         )
         if tangents is not None:
@@ -493,7 +493,7 @@ class SoftDynamics(AbstractSphereDynamics):
         passed = duration * jnp.sqrt(T)
         stored = new.internal.elastic
         trend = cooling_trend(scene, T)
-        collisions = 2 * replicas / len(new.position) * begun
+        collisions = 2 * replicas / len(new.position) * begun.astype(lost.dtype)
         amounts = [lost, collisions]
         trends = [(energy + stored) * trend * duration, passed]
         spin = new.internal.spin

@@ -324,7 +324,7 @@ def integrate(
         pairs = pairs._replace(
             dissipated=pairs.dissipated + dt * force.lost,
             exchanged=pairs.exchanged + dt * force.exchanged,
-            begun=pairs.begun + (touching & ~pairs.touching),
+            begun=pairs.begun + (touching & ~pairs.touching).astype(pairs.begun.dtype),
             touching=touching,
         )
         if container is not None and walls is not None:
@@ -360,7 +360,7 @@ def integrate(
 
     # Contacts may also begin in the last half drift.
     xi, _, touching = overlap(members.x, a, b, offset)
-    begun = pairs.begun + (touching & ~pairs.touching)
+    begun = pairs.begun + (touching & ~pairs.touching).astype(pairs.begun.dtype)
     pairs = pairs._replace(
         begun=begun,
         touching=touching,
