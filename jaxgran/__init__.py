@@ -29,6 +29,8 @@ from jaxgran.data.example import example_measurement as example_measurement
 from jaxgran.data.measurement import Measurement as Measurement
 from jaxgran.data.measurement import read_measurement as read_measurement
 from jaxgran.data.particles import read_particles as read_particles
+from jaxgran.data.track_impacts import Impacts as Impacts
+from jaxgran.data.track_impacts import read_impacts as read_impacts
 from jaxgran.fitting.alternatives import Alternative as Alternative
 from jaxgran.fitting.fit import fit as fit
 from jaxgran.fitting.imitate import Imitation as Imitation

@@ -53,9 +53,11 @@ class FitOptions:
     """Options of `jaxgran fit`.
 
     Attributes:
-        drop_test: One or more CSV files with columns v,eps,eps_err: single impacts of the spheres
-            of the first curve, fitted jointly with it; without a curve their own header gives
-            diameter, density, Y and nu.
+        drop_test: One or more CSV files with columns v,eps,eps_err, or of oblique impacts
+            v_n,v_t,eps,eps_err,eps_t,eps_t_err: single impacts of the spheres of the first curve,
+            fitted jointly with it; without a curve their own header gives diameter, density, Y and
+            nu.
+        impacts: Fit single impacts of the tracks of each curve, too.
         onto_plate: The impacts of the drop tests are on a thick plate of the same material.
         model: Model to use; auto takes the cheapest one whose estimated error is within the
             tolerance.
@@ -80,6 +82,7 @@ class FitOptions:
     """
 
     drop_test: Annotated[tuple[Path, ...], Several] = ()
+    impacts: bool = False
     onto_plate: bool = False
     model: ModelOrAuto = "kinetic-theory"
     tolerance: float = 0.02

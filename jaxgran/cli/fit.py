@@ -47,7 +47,7 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
     resolved = [path.resolve() for path in files]
     if repeated := [str(path) for path in resolved if resolved.count(path) > 1]:
         raise ValueError(f"{repeated[0]} is given twice. Give each measurement once.")
-    is_single = len(files) == 1
+    is_single = len(files) == 1 and not options.impacts
     if not (is_single and paths) and options.model != JOINT_MODEL:
         raise ValueError(
             f"--model {options.model}: drop tests and several measurements are fitted with "
@@ -109,7 +109,7 @@ def read_all(paths: Sequence[Path], options: FitOptions) -> dict[str, jaxgran.Me
     given = parse_settings(options.set)
     measurements: dict[str, jaxgran.Measurement] = {}
     drops = {"onto": "plate"} if options.onto_plate else {}
-    is_single = len(paths) + len(options.drop_test) == 1
+    is_single = len(paths) + len(options.drop_test) == 1 and not options.impacts
     for path in (*paths, *options.drop_test):
         label = path.stem if path.stem not in measurements else str(path)
         label = "" if is_single else label
@@ -123,6 +123,9 @@ def read_all(paths: Sequence[Path], options: FitOptions) -> dict[str, jaxgran.Me
             raise ValueError(f"{path} is a drop test. Give it as --drop-test {path}.")
         if not is_drop_test and path not in paths:
             raise ValueError(f"{path} is a cooling curve. Give it without --drop-test.")
+        if options.impacts and path in paths:
+            found = jaxgran.read_impacts(path, given).measurements
+            measurements |= {f"{label} {name}": m for name, m in found.items()}
         if options.absent:
             measurements[label] = with_absent(measurements[label], options.absent)
     return measurements

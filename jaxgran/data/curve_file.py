@@ -19,8 +19,9 @@ from jaxgran._utils.validation import check_bool
 from jaxgran.data import files, tracks
 from jaxgran.data.curve import QUANTITIES, CoolingCurve, check_values, from_arrays, to_arrays
 from jaxgran.data.definitions import BY_COLUMN, TEMPERATURE_COLUMNS
-from jaxgran.data.drop_test import DROP_TEST_COLUMNS, DropTest
-from jaxgran.data.header import checked_header, gas_or_none, header_choice
+from jaxgran.data.drop_test import DropTest
+from jaxgran.data.header import checked_header, gas_or_none
+from jaxgran.data.impacts import drop_test_columns, drop_test_of_table, is_drop_test
 from jaxgran.data.questions import ask_about_columns, ask_about_speeds, scene_of
 from jaxgran.data.tables import Table, header_entry, header_in_si, read_table
 
@@ -102,10 +103,9 @@ def read_data(path: Path, given: dict[str, str]) -> Content:
     table = read_table(path, WANTED, _columns_to_read, given, tracks.IDENTITIES)
     header = table.header
     columns = table.columns
-    if "eps" in columns:
-        onto = header_choice(header, "onto", ("sphere", "plate"))
-        test = DropTest(columns["v"], columns["eps"], columns["eps_err"], onto == "plate")
-        return Content(test, header, list(ask_about_speeds(test)))
+    if is_drop_test(list(columns)):
+        test, questions = drop_test_of_table(table)
+        return Content(test, header, [*ask_about_speeds(columns), *questions])
     if "x" in columns:
         gas = gas_or_none(ANY_MATERIAL | header)
         curve, questions = tracks.curve_of_tracks(columns, header, table.lines, gas)
@@ -127,13 +127,8 @@ def _columns_to_read(names: list[str]) -> list[str]:
     """Return the columns; raise ValueError if one is unknown, missing or repeated."""
     if "x" in names or "id" in names:
         return tracks.track_columns(names)
-    if "eps" in names:
-        if sorted(names) != sorted(DROP_TEST_COLUMNS):
-            wanted = ",".join(DROP_TEST_COLUMNS)
-            raise ValueError(
-                f"the columns are {', '.join(names)}; name those of a drop test {wanted}"
-            )
-        return names
+    if is_drop_test(names):
+        return drop_test_columns(names)
     temperatures = [name for name in ("T", *TEMPERATURE_COLUMNS) if name in names]
     known = {quantity.column for quantity in QUANTITIES.values()}
     known |= {end for name in temperatures for end in (name, f"{name}_err")}

@@ -1,35 +1,77 @@
-"""Drop tests: coefficients of restitution of single impacts at known normal speeds."""
+"""Drop tests: normal and tangential restitution of single impacts at known speeds."""
+
+from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxgran._utils.validation import POSITIVE, UserNumber, check_bool, float_array
+from jaxgran._utils.validation import (
+    NON_NEGATIVE,
+    POSITIVE,
+    Domain,
+    UserNumber,
+    check_bool,
+    float_array,
+)
+from jaxgran.scene.elements import Rough
 from jaxgran.scene.gas import Gas
 
-DROP_TEST_COLUMNS = ("v", "eps", "eps_err")
-"""Columns of a file of a drop test."""
-
 MAX_SIGMAS = 5.0
-"""Largest distance of a measured eps above 1, in standard errors, that is taken for chance."""
+"""Largest distance of a measured restitution outside its range, in standard errors, that is taken
+for chance."""
+
+SPHERE, PLATE, WALL = "sphere", "plate", "wall"
+PARTNERS = (SPHERE, PLATE, WALL)
+"""What a sphere meets: an equal one, a thick plate of its material, or a wall of the container."""
+
+OBLIQUE = ("tangential_speed", "tangential_restitution", "tangential_error")
+"""Fields of oblique impacts, which are given together."""
+
+
+def _floats_or_none(value: UserNumber | None) -> Array | None:
+    return None if value is None else float_array(value)
 
 
 class DropTest(eqx.Module):
-    """Coefficients of restitution of single impacts at some normal speeds.
+    """Restitution of single impacts, normal or oblique, at some speeds.
 
-    They depend on ``A Y^(2/5)``, as the cooling of a gas of hard spheres does, and on no other
-    quantity of a cooling curve.
+    The normal restitution eps depends on ``A Y^(2/5)``, as the cooling of a gas of hard spheres
+    does, and on no other quantity of a cooling curve. The tangential one, ``eps_t = u_t'/u_t`` of
+    the velocity of the surfaces at contact, is ``-beta_t`` where the spheres stick, and follows
+    Coulomb's law where they slide (`jaxgran.Rough`), with one sphere or a plate as the partner:
+
+        eps_t = 1 - min(1 + beta_t, (1 + 1/q) mu (1 + eps) v_n/v_t).
+
+    The velocity of the centre of a sphere that does not rotate before the impact is multiplied by
+    ``1 - q/(1 + q) (1 - eps_t)``.
 
     Args:
-        speed: normal relative speed before each impact, m/s, shape (n,), > 0.
-        restitution: eps, shape (n,), > 0; above 1 only within its error.
+        speed: normal relative speed v_n before each impact, m/s, shape (n,), > 0.
+        restitution: eps, shape (n,); below 0 or above 1 only within its error.
         error: standard error of each eps, shape (n,), > 0.
-        onto_plate: whether a sphere falls onto a thick plate of the same material, which makes
-            ``alpha`` smaller by sqrt(2); if False, two equal spheres collide.
+        onto: the partner: "sphere", an equal one; "plate", a thick plate of the same material,
+            which makes ``alpha`` smaller by sqrt(2); or "wall", a wall of the gas's container.
+        tangential_speed: v_t of the surfaces at contact before each oblique impact, m/s, shape
+            (n,), > 0; None for normal impacts.
+        tangential_restitution: eps_t, shape (n,), in [-1, 1] within its error.
+        tangential_error: standard error of each eps_t, shape (n,), > 0.
+        of_centres: whether tangential_restitution is the ratio of velocities of the centre, of
+            spheres that do not rotate before the impact.
+        speed_error: standard error of each speed, m/s, shape (n,), >= 0, where eps is the ratio of
+            two measured speeds; `error` is then that of the speed after over the speed before.
+            None if the speeds are known.
+        correlation: of the errors of the speeds before and after, shape (n,), in [-1, 1]; None
+            for 0.
+        scatters: whether eps scatters from impact to impact by more than its error, as rough
+            surfaces make it; a fit then estimates the standard deviation of this scatter.
 
     Raises:
         ValueError: for a value out of its range, or lists of different lengths.
+
+    Reference: Foerster, Louge, Chang & Allia, Phys. Fluids 6, 1108 (1994).
 
     >>> drops = jaxgran.DropTest(speed=[0.1, 0.3], restitution=[0.92, 0.90], error=[0.01, 0.01])
     >>> drops.speed.shape
@@ -39,36 +81,150 @@ class DropTest(eqx.Module):
     speed: UserNumber = eqx.field(converter=float_array)
     restitution: UserNumber = eqx.field(converter=float_array)
     error: UserNumber = eqx.field(converter=float_array)
-    onto_plate: bool = eqx.field(static=True, default=False)
+    onto: str = eqx.field(static=True, default=SPHERE)
+    tangential_speed: UserNumber | None = eqx.field(converter=_floats_or_none, default=None)
+    tangential_restitution: UserNumber | None = eqx.field(converter=_floats_or_none, default=None)
+    tangential_error: UserNumber | None = eqx.field(converter=_floats_or_none, default=None)
+    of_centres: bool = eqx.field(static=True, default=False)
+    speed_error: UserNumber | None = eqx.field(converter=_floats_or_none, default=None)
+    correlation: UserNumber | None = eqx.field(converter=_floats_or_none, default=None)
+    scatters: bool = eqx.field(static=True, default=False)
+
+    advice: ClassVar[dict[str, str]] = {
+        "speed": "Give normal speeds in m/s.",
+        "restitution": "Give the speed after over that before an impact.",
+        "error": "Give the standard error of each eps.",
+        "tangential_speed": "Give the speed of the surfaces at contact in m/s; normal impacts are "
+        "a drop test of their own.",
+        "tangential_restitution": "Give eps_t = -beta_t, the tangential velocity after over that "
+        "before an impact.",
+        "tangential_error": "Give the standard error of each eps_t.",
+        "speed_error": "Give the standard error of each speed in m/s.",
+    }
 
     def __check_init__(self):
-        check_bool(onto_plate=self.onto_plate)
-        POSITIVE.check("speed", self.speed, "Give normal speeds in m/s.")
-        advice = "Give the speed after over that before an impact."
-        POSITIVE.check("restitution", self.restitution, advice)
-        POSITIVE.check("error", self.error, "Give the standard error of each eps.")
-        shapes = [np.shape(x) for x in (self.speed, self.restitution, self.error)]
+        check_bool(of_centres=self.of_centres, scatters=self.scatters)
+        if self.onto not in PARTNERS:
+            raise ValueError(f"onto must be one of {', '.join(PARTNERS)}, got {self.onto!r}")
+        given = [name for name in OBLIQUE if getattr(self, name) is not None]
+        if given and len(given) < len(OBLIQUE):
+            raise ValueError(f"{', '.join(OBLIQUE)} are given together, got {', '.join(given)}")
+        positive = ["speed", "error"] + [x for x in given if x != "tangential_restitution"]
+        for name in positive:
+            POSITIVE.check(name, getattr(self, name), self.advice[name])
+        if self.speed_error is not None:
+            NON_NEGATIVE.check("speed_error", self.speed_error, self.advice["speed_error"])
+        if self.correlation is not None:
+            Domain(-1, 1, True, True).check("correlation", self.correlation, "Give none for 0.")
+        names = ["speed", "restitution", "error", *given]
+        names += [x for x in ("speed_error", "correlation") if getattr(self, x) is not None]
+        shapes = [np.shape(getattr(self, name)) for name in names]
         if len(shapes[0]) != 1 or len(set(shapes)) > 1 or shapes[0] == (0,):
             raise ValueError(
-                "speed, restitution and error must be lists of equal length, with at least one "
-                f"impact; got shapes {', '.join(map(str, shapes))}"
+                f"{', '.join(names[:-1])} and {names[-1]} must be lists of equal length, with at "
+                f"least one impact; got shapes {', '.join(map(str, shapes))}"
             )
-        eps = np.asarray(self.restitution)
-        error = np.asarray(self.error)
-        above = eps > 1 + MAX_SIGMAS * error
-        if np.any(above):
-            i = int(np.argmax(above))
+        self._check_range("restitution", self.errors_of_ratio(), 0.0)
+        if self.is_oblique:
+            self._check_range("tangential_restitution", np.asarray(self.tangential_error), -1.0)
+
+    def _check_range(self, name: str, error: np.ndarray, low: float) -> None:
+        value = np.asarray(getattr(self, name))
+        outside = ~((value <= 1 + MAX_SIGMAS * error) & (value >= low - MAX_SIGMAS * error))
+        if np.any(outside):
+            i = int(np.argmax(outside))
+            limit = "most 1" if value[i] > low else f"least {low:g}"
             raise ValueError(
-                f"restitution must be at most 1 within its error, got {eps[i]:g} +- {error[i]:g}. "
-                f"{advice}"
+                f"{name} must be at {limit} within its error, got {value[i]:g} +- {error[i]:g}. "
+                f"{self.advice[name]}"
+            )
+
+    @property
+    def is_oblique(self) -> bool:
+        """Whether the tangential restitution was measured, too."""
+        return self.tangential_speed is not None
+
+    @property
+    def num_values(self) -> int:
+        """Number of measured values of restitution."""
+        return int(np.size(self.restitution)) * (1 + self.is_oblique)
+
+    def errors_of_ratio(self) -> Float[np.ndarray, "n"]:
+        """Return the standard error of each eps, with that of the speed before the impact."""
+        return np.asarray(self._error_with(np.asarray(self.restitution)))
+
+    def _error_with(self, slope: Array | np.ndarray) -> Float[Array, "n"]:
+        """Return the error of the speed after minus `slope` times that before, over the latter."""
+        error = jnp.asarray(self.error)
+        if self.speed_error is None:
+            return error
+        relative = slope * jnp.asarray(self.speed_error) / jnp.asarray(self.speed)
+        shared = 0.0 if self.correlation is None else jnp.asarray(self.correlation)
+        return jnp.sqrt(error**2 + relative**2 - 2 * shared * error * relative)
+
+    def check_gas(self, gas: Gas) -> None:
+        """Raise ValueError for a gas that lacks the elements on which these impacts depend."""
+        walls = gas.container
+        if self.onto == WALL and walls is None:
+            raise ValueError(
+                "impacts onto a wall need the walls of the gas: add container_side and "
+                "wall_restitution to the header (container=jaxgran.Walls(...)). For a thick plate "
+                "of the material of the spheres write onto: plate"
+            )
+        if not self.is_oblique:
+            return
+        if not isinstance(gas.surface, Rough):
+            raise ValueError(
+                "the tangential restitution eps_t needs rough spheres in instantaneous impacts: "
+                "add `beta_t: guess` and, if they slide, `friction: guess` to the header "
+                "(surface=jaxgran.Rough(...)), and free both"
+            )
+        if self.onto == WALL and walls is not None and walls.tangential_restitution is None:
+            raise ValueError(
+                "the tangential restitution of impacts onto a wall needs rough walls: add "
+                "`wall_beta_t: guess` to the header"
             )
 
     def computed(self, gas: Gas) -> Float[Array, "n"]:
         """Return eps of each impact, for spheres of a gas."""
-        reduced = gas.law.on_wall if self.onto_plate else gas.law.reduced
-        law = reduced(diameter=gas.diameter, mass=gas.mass, speed=jnp.ones(()))
-        return law.restitution(jnp.asarray(self.speed))
+        return self._with_slope(gas)[0]
 
-    def residuals(self, gas: Gas) -> Float[Array, "n"]:
-        """Return (measured - computed eps) over the error, for spheres of a gas."""
-        return (jnp.asarray(self.restitution) - self.computed(gas)) / jnp.asarray(self.error)
+    def _with_slope(self, gas: Gas) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+        """Return eps of each impact, and the derivative of the speed after it in that before."""
+        law = gas.container.restitution if self.onto == WALL and gas.container else gas.law
+        reduced = law.reduced if self.onto == SPHERE else law.on_wall
+        known = reduced(diameter=gas.diameter, mass=gas.mass, speed=jnp.ones(()))
+        v = jnp.asarray(self.speed)
+        eps, change = jax.jvp(known.restitution, (v,), (jnp.ones_like(v),))
+        return eps, eps + v * change
+
+    def computed_tangential(self, gas: Gas) -> Float[Array, "n"]:
+        """Return eps_t of each oblique impact, for rough spheres of a gas."""
+        surface = gas.surface
+        assert isinstance(surface, Rough)
+        beta = surface.tangential_restitution
+        if self.onto == WALL:
+            assert gas.container is not None and gas.container.tangential_restitution is not None
+            beta = gas.container.tangential_restitution
+        q = surface.inertia
+        steepness = jnp.asarray(self.speed) / jnp.asarray(self.tangential_speed)
+        change = jnp.broadcast_to(1 + beta, steepness.shape)
+        if surface.friction is not None:
+            sliding = (1 + 1 / q) * surface.friction * (1 + self.computed(gas)) * steepness
+            change = jnp.minimum(change, sliding)
+        return 1 - change * (q / (1 + q) if self.of_centres else 1.0)
+
+    def errors(self, gas: Gas) -> Float[Array, "n"]:
+        """Return the standard error of eps minus that computed at the measured speed."""
+        return self._error_with(self._with_slope(gas)[1])
+
+    def residuals(self, gas: Gas) -> Float[Array, "values"]:
+        """Return measured minus computed restitution over the error, for spheres of a gas.
+
+        The values of eps are followed by those of eps_t.
+        """
+        normal = (jnp.asarray(self.restitution) - self.computed(gas)) / self.errors(gas)
+        if not self.is_oblique:
+            return normal
+        difference = jnp.asarray(self.tangential_restitution) - self.computed_tangential(gas)
+        return jnp.concatenate([normal, difference / jnp.asarray(self.tangential_error)])

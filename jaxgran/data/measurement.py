@@ -138,7 +138,9 @@ class Measurement(eqx.Module):
         if isinstance(data, CoolingCurve):
             data.check_measured()
             _check_magnitudes(data)
-        elif not isinstance(data, DropTest):
+        elif isinstance(data, DropTest):
+            data.check_gas(gas)
+        else:
             raise ValueError(
                 f"data must be a jaxgran.CoolingCurve or a jaxgran.DropTest, got "
                 f"{type(data).__name__}. Make a curve of arrays by jaxgran.CoolingCurve(t, T), of "
@@ -214,8 +216,10 @@ def read_measurement(
             measured, T_err (m^2/s^2), T_rot, T_rot_err, msd and msd_err (m^2), in any order. In
             place of T there may be mean_speed, vx2, v2_xy or energy
             (`jaxgran.data.curve_file.TEMPERATURE_COLUMNS`), with errors under the same name and
-            _err. A drop test has the columns v (m/s), eps and eps_err. Tracks of particles have
-            the columns id,t,x,y and, where measured, z (`jaxgran.data.tracks.curve_of_tracks`).
+            _err. A drop test has the columns v (m/s), eps and eps_err; oblique impacts have
+            v_n,v_t (or v,angle), eps, eps_err, eps_t and eps_t_err, or velocities and spins
+            (`jaxgran.data.impacts.drop_test_of_table`). Tracks of particles have the columns
+            id,t,x,y and, where measured, z (`jaxgran.data.tracks.curve_of_tracks`).
             Units may stand after a name or a value, as in ``t (ms)`` and ``# diameter: 2 mm``;
             header keys length_unit, time_unit and speed_unit, which holds for T squared, give
             those of all other columns and of diameter, T0, A and the like; other numbers are in
@@ -226,8 +230,9 @@ def read_measurement(
         header: entries that count as those of the file, before anything is read; they replace
             entries with the same key. Keys are those of `jaxgran.data.header.gas_of_header` and
             `priors_of_header`, N, replicas, absent, tracked, T0_of ("run" or "ensemble"),
-            T_scale_err, errors ("measured"), which stand for the arguments of `Measurement`, onto
-            (of a drop test: "sphere" or "plate"), and those of tracks.
+            T_scale_err, errors ("measured"), which stand for the arguments of `Measurement`, those
+            of drop tests, onto ("sphere", "plate" or "wall") and spin_before ("0"), and those of
+            tracks.
         gas: the gas in place of that of the header, such as that of a curve for a drop test.
 
     Returns:

@@ -14,11 +14,13 @@ from jaxtyping import Array
 from jaxgran.data import files
 from jaxgran.data.curve import MIN_POINTS, QUANTITIES, CoolingCurve, above_noise
 from jaxgran.data.definitions import Scene, other_definitions
-from jaxgran.data.drop_test import DropTest
 from jaxgran.data.tables import UNITS, unit_in
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass
 from jaxgran.scene.parameters import REQUIRED
+
+SPEEDS = {"v", "v_n", "v_t", "vx", "vy", "vz"}
+"""Columns of speeds before impacts."""
 
 USUAL_RANGES = {
     "diameter": (1e-7, 0.1),
@@ -34,7 +36,7 @@ USUAL_RANGES = {
     "T": (0.0, 900.0),
     "msd": (0.0, 1e4),
     "T_rot": (0.0, 900.0),
-    "v": (0.0, 8.0),  # a drop from 3 m
+    **dict.fromkeys(SPEEDS, (0.0, 8.0)),  # a drop from 3 m
 }
 """Smallest and largest usual value of header keys and columns in granular gases."""
 
@@ -103,11 +105,12 @@ def _unit_question(name: str, value: float, line: str) -> str:
     return f"{name} is {value:.6g} {base}, and usual is {low:g} to {high:g}: {question}"
 
 
-def ask_about_speeds(test: DropTest) -> Iterator[str]:
-    """Yield questions about unusual speeds of a drop test."""
-    largest = float(np.max(np.asarray(test.speed)))
-    if not _is_usual("v", largest):
-        yield _unit_question("v", largest, "")
+def ask_about_speeds(columns: dict[str, np.ndarray]) -> Iterator[str]:
+    """Yield questions about unusual speeds among the columns of a drop test."""
+    for name in SPEEDS & columns.keys():
+        largest = float(np.max(np.abs(columns[name])))
+        if not _is_usual(name, largest):
+            yield _unit_question(name, largest, "")
 
 
 def scene_of(header: dict[str, str]) -> Scene:

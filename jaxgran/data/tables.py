@@ -40,7 +40,12 @@ COLUMN_UNITS = {
     **dict.fromkeys(("mean_speed", "mean_speed_xyz", "mean_speed_xy", "mean_speed_x", "v"), "m/s"),
     **dict.fromkeys(("vx2", "v2_xy", "v2"), "m^2/s^2"),
     **dict.fromkeys(("energy", "total_energy"), "J"),
-    "eps": "1",
+    **dict.fromkeys(("v_n", "v_t"), "m/s"),
+    **{f"v{x}{end}": "m/s" for x in "xyz" for end in ("", "_after")},
+    **{f"w{x}{end}": "rad/s" for x in "xyz" for end in ("", "_after")},
+    "w": "rad/s",
+    "angle": "deg",
+    **dict.fromkeys(("eps", "eps_t", "eps_t_center"), "1"),
 }
 """Unit of each column; that of a standard error, x_err, is that of x."""
 
@@ -94,6 +99,7 @@ class Table(NamedTuple):
         lines: line number of each row, counted from 1.
         cells: the columns as they were written.
         factors: the value in SI of the unit of each column.
+        units: the unit that stands behind the name of each column, or "".
         num_left_out: number of rows that were left out as they have no identity.
     """
 
@@ -102,6 +108,7 @@ class Table(NamedTuple):
     lines: list[int]
     cells: dict[str, list[str]]
     factors: dict[str, float]
+    units: dict[str, str]
     num_left_out: int
 
     def last_digits(self, name: str) -> Float[np.ndarray, "rows"]:
@@ -229,6 +236,7 @@ def read_table(
         list(rows),
         {name: [row[k] for row in rows.values()] for name, k in zip(chosen, at, strict=True)},
         {name: factors[k] for name, k in zip(chosen, at, strict=True)},
+        {name: dict(told)[name] for name in chosen},
         without,
     )
 

@@ -250,9 +250,14 @@ def _identities(columns: Mapping[str, np.ndarray]) -> np.ndarray:
     return next(columns[name] for name in IDENTITIES if name in columns)
 
 
-def _steps(
+def positions_of_tracks(
     columns: Mapping[str, np.ndarray], header: dict[str, str], lines: list[int]
-) -> list[Step]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the particle, time and position of each row of tracks, sorted by time and particle.
+
+    Raises:
+        ValueError: for a particle without a number or twice in a frame, and frames without times.
+    """
     ids = _identities(columns)
     coordinates = [name for name in COORDINATES if name in columns]
     if "z" in columns and np.ptp(columns["z"]) == 0:  # as TrackMate writes for pictures
@@ -278,8 +283,15 @@ def _steps(
             f"line {lines[j]}: particle {ids[j]:g} at t = {t[j]:g} s is given again, after line "
             f"{lines[i]}; remove one"
         )
+    return ids[order], t[order], position[order]
+
+
+def _steps(
+    columns: Mapping[str, np.ndarray], header: dict[str, str], lines: list[int]
+) -> list[Step]:
+    ids, t, position = positions_of_tracks(columns, header, lines)
     side = header_number(header, "box_side") if "box_side" in header else np.inf
-    frames = np.split(order, np.flatnonzero(np.diff(t[order])) + 1)
+    frames = np.split(np.arange(t.size), np.flatnonzero(np.diff(t)) + 1)
     pairs = zip(frames, frames[1:], strict=False)
     return [_step(before, after, ids, t, position, side) for before, after in pairs]
 

@@ -132,7 +132,7 @@ class Kind(NamedTuple):
         values: values of parameters at an amplitude, given the label of the measurement.
         rate_error: relative error of kinetic theory's cooling rate by it, at an amplitude.
         one_minimum: False if amplitudes beyond excluded ones may be allowed.
-        changes_law: whether it is in the law of the spheres, which drop tests have, too.
+        changes_law: whether it is in the law of impacts, which drop tests obey, too.
         keeps_A: False if A has no meaning in it: it is not part of the range.
     """
 
@@ -423,7 +423,11 @@ def _kinds(problem: Problem, flat: np.ndarray, absent: tuple[str, ...]) -> list[
     ]
     if all(beta_t in gas.domains for gas in scenes.values()):
         sliding = Kind(
-            "grains that slide", ("friction",), (SLIDING,), lambda x, label: {"friction": 1 / x}
+            "grains that slide",
+            ("friction",),
+            (SLIDING,),
+            lambda x, label: {"friction": 1 / x},
+            changes_law=True,
         )
         possible.append(sliding)
     known = {u.name for u in problem.unknowns}

@@ -224,9 +224,11 @@ def _check_no_copies(measurements: dict[str, Measurement]) -> None:
 def _rows_of(data: CoolingCurve | DropTest) -> set[tuple[str, ...]]:
     """Return the measured values as texts of 6 digits, in which copies in other units agree."""
     if isinstance(data, DropTest):
-        columns = (data.speed, data.restitution, data.error)
+        columns = [data.speed, data.restitution, data.error]
+        if data.is_oblique:
+            columns += [data.tangential_speed, data.tangential_restitution]
     else:
-        columns = (data.times, data.temperature)
+        columns = [data.times, data.temperature]
     rows = zip(*(np.asarray(x).tolist() for x in columns), strict=True)
     return {tuple(f"{x:.6g}" for x in row) for row in rows}
 

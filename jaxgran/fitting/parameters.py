@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran._utils.validation import Domain
 from jaxgran.data.curve import CoolingCurve, above_noise
-from jaxgran.data.drop_test import DropTest
+from jaxgran.data.drop_test import PLATE, WALL, DropTest
 from jaxgran.data.measurement import DENSITY, START_TIME, Priors, prior_domain
 from jaxgran.scene.gas import Gas, law_fields
 from jaxgran.scene.laws import C1, ConstantRestitution, RestitutionSpline, Viscoelastic
@@ -26,6 +26,9 @@ LAW = "law"
 
 SHARED = ""
 """Label of the priors of parameters that all measurements share."""
+
+MAX_GUESSES = 24
+"""Number of values of beta_t, and of mu, that are compared with oblique impacts."""
 
 SMOOTHNESS = "smoothness"
 """Name of the prior that a law of restitution brings."""
@@ -135,16 +138,50 @@ def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
     return with_floats(gas, as_floats({name: x for name, x in values.items() if name in free}))
 
 
-def guess_from_drops(gas: Gas, test: DropTest, free: tuple[str, ...]) -> Gas:
-    """Return the gas with A as in ``eps = exp(-C1 beta)`` of the median impact."""
-    law = gas.law
-    if not isinstance(law, Viscoelastic) or "dissipative_constant" not in free:
-        return gas
-    speed, eps = np.median(np.asarray(test.speed)), np.median(np.asarray(test.restitution))
-    law = law.of_wall() if test.onto_plate else law
-    alpha = law.alpha(diameter=gas.diameter, mass=gas.mass)
-    loss = -np.log(np.clip(eps, 1e-3, 0.999))
-    return gas.replace(dissipative_constant=loss / (1.5 * C1 * alpha**0.4 * speed**0.2))
+def guess_from_drops(gas: Gas, test: DropTest, free: tuple[str, ...]) -> dict[str, Any]:
+    """Return guesses of free parameters on which the impacts of a drop test depend, by name.
+
+    A is that of ``eps = exp(-C1 beta)`` of the median impact, a constant restitution the median
+    one, and beta_t and mu are those of oblique impacts (`_guess_tangential`).
+    """
+    values: dict[str, Any] = {}
+    eps = np.clip(np.median(np.asarray(test.restitution)), 1e-3, 0.999)
+    if test.onto == WALL:
+        values["wall_coefficient"] = eps
+    else:
+        values["coefficient"] = eps
+        if isinstance(gas.law, Viscoelastic):
+            law = gas.law.of_wall() if test.onto == PLATE else gas.law
+            alpha = law.alpha(diameter=gas.diameter, mass=gas.mass)
+            speed = np.median(np.asarray(test.speed))
+            loss = -np.log(eps) / (1.5 * C1 * alpha**0.4 * speed**0.2)
+            values["dissipative_constant"] = loss
+    if test.is_oblique:
+        of_beta = "wall_" * (test.onto == WALL) + "tangential_restitution"
+        values[of_beta], values["friction"] = _guess_tangential(gas, test)
+    return {name: x for name, x in values.items() if name in free and name in gas.domains}
+
+
+def _guess_tangential(gas: Gas, test: DropTest) -> tuple[float, float]:
+    """Return beta_t and mu of oblique impacts.
+
+    Each impact gives the beta_t with which it would stick, and the mu with which it would slide.
+    The pair of these that fits all impacts best is the guess.
+    """
+    q = float(gas.value("inertia"))
+    change = 1 - np.asarray(test.tangential_restitution)
+    if test.of_centres:
+        change = change * (1 + q) / q
+    steepness = np.asarray(test.speed) / np.asarray(test.tangential_speed)
+    of_unit_friction = (1 + 1 / q) * (1 + np.asarray(test.restitution)) * steepness
+    shares = np.linspace(0, 1, MAX_GUESSES)
+    sticking = np.clip(np.quantile(change, shares), 0.02, 1.98)
+    friction = np.clip(np.quantile(change / of_unit_friction, shares), 0.01, 10.0)
+    sliding = friction[:, None] * of_unit_friction
+    computed = np.minimum(sticking[:, None, None], sliding)
+    misfit = np.sum(((change - computed) / np.asarray(test.tangential_error)) ** 2, axis=-1)
+    i, j = np.unravel_index(np.argmin(misfit), misfit.shape)
+    return float(sticking[i] - 1), float(friction[j])
 
 
 def _guess_law(gas: Gas, rate: Any, free: tuple[str, ...]) -> dict[str, Any]:

@@ -217,7 +217,8 @@ class Problem:
             if isinstance(m, DropRows):
                 floats = {n: jnp.asarray(x) for n, x in own.items() if n in m.gas.domains}
                 row, slopes = residuals_and_slopes(m.data.residuals, m.gas, floats)
-                widening = np.hypot(1.0, own.get("spread", 0.0) / np.asarray(m.data.error))
+                row = np.asarray(row)
+                widening = m.widening(floats, row)
                 slopes = {name: x / widening[:, None] for name, x in slopes.items()}
                 add("drop test", m.label, row / widening, slopes, is_prior=False)
                 rows[-1] = rows[-1]._replace(log_variance=2 * np.log(widening))

@@ -98,6 +98,13 @@ def _scene(result: Fit, label: str) -> Iterator[str]:
     if isinstance(measurement.data, DropTest):
         v = np.asarray(measurement.data.speed)
         yield f"drops    {name}{v.size} impacts, v = {v.min():.3g} .. {v.max():.3g} m/s"
+        if measurement.data.is_oblique:
+            tilt = np.degrees(np.arctan2(np.asarray(measurement.data.tangential_speed), v))
+            yield f"         oblique, {tilt.min():.2g} .. {tilt.max():.2g} degrees from the normal"
+        origin = dict(measurement.header).get("impacts_from")
+        if origin is not None:
+            yield f"         {origin}"
+            yield "         they share grains with T(t), and hardly errors"
         return
     T = np.asarray(measurement.data.temperature)
     last = T[above_noise(measurement.data)][-1]

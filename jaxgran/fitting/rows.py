@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scipy  # which imports scipy.optimize at its first use
 from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran._utils.tracing import grid_size
@@ -13,11 +14,13 @@ from jaxgran._utils.validation import float_array
 from jaxgran.data.curve import NOISE, CoolingCurve
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import Measurement
+from jaxgran.fitting.parameters import with_floats
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.choose import error_model_along
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.linearise import (
     curve_of_program,
+    with_coulomb_limit,
     with_neutral_elements,
     with_variant_law,
 )
@@ -51,6 +54,9 @@ UNKNOWN_NUMBER = 1e3
 
 SCATTER_ERROR = 0.05
 """Relative error of the variance that theory gives to a run of N grains."""
+
+MIN_SCATTER = 1e-3
+"""Smallest scatter of eps that is searched, over the smallest error."""
 
 ERRORS_OF_PARTICLES = 0.1
 """Relative difference up to which T_err is taken for the fluctuation of independent samples."""
@@ -230,8 +236,8 @@ class DropRows:
 
     @property
     def gas(self) -> Gas:
-        """The gas of the spheres, with the law that alternative explanations change."""
-        return with_variant_law(self.measurement.gas)
+        """The gas of the spheres, with the law and the friction that alternatives change."""
+        return with_variant_law(with_coulomb_limit(self.measurement.gas))
 
     @property
     def scene(self) -> Gas:
@@ -244,15 +250,54 @@ class DropRows:
         assert isinstance(self.measurement.data, DropTest)
         return self.measurement.data
 
+    def widening(self, values: dict[str, Any], residuals: np.ndarray) -> np.ndarray:
+        """Return the factor by which eps that scatters from impact to impact widens each error.
+
+        Args:
+            values: of floats of the gas, by name; "spread" is the scatter of eps. Without it the
+                most likely scatter is taken where eps scatters (`DropTest.scatters`).
+            residuals: measured minus computed values, over their errors.
+        """
+        factors = np.ones(self.data.num_values)
+        if "spread" not in values and not self.data.scatters:
+            return factors
+        errors = np.asarray(self.data.errors(with_floats(self.gas, values)))
+        spread = float(values.get("spread", 0.0))
+        if "spread" not in values:
+            spread = most_likely_scatter(residuals[: errors.size], errors)
+        factors[: errors.size] = np.hypot(1.0, spread / errors)
+        return factors
+
     @property
     def num_points(self) -> int:
-        """Number of impacts."""
-        return int(np.size(self.data.restitution))
+        """Number of measured values of restitution."""
+        return self.data.num_values
 
     @property
     def nuisances(self) -> dict[str, float]:
         """It has no nuisance parameters."""
         return {}
+
+
+def most_likely_scatter(residuals: np.ndarray, errors: np.ndarray) -> float:
+    """Return the standard deviation of the scatter of values beyond their errors, >= 0.
+
+    It maximises the likelihood of Gaussian values; -2 ln L then has no slope in it.
+
+    Args:
+        residuals: differences over their errors.
+        errors: standard errors.
+    """
+    square = (residuals * errors) ** 2
+
+    def misfit(log_variance: float) -> float:
+        variance = errors**2 + np.exp(log_variance)
+        return float(np.sum(square / variance + np.log(variance)))
+
+    largest = np.log(np.max(square) + np.max(errors) ** 2)
+    least = 2 * np.log(MIN_SCATTER * np.min(errors))
+    found = scipy.optimize.minimize_scalar(misfit, bounds=(least, largest), method="bounded")
+    return float(np.exp(found.x / 2))
 
 
 def curve_rows(

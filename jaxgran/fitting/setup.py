@@ -20,6 +20,9 @@ from jaxgran.fitting.rows import CurveRows, DropRows, curve_rows, with_rate_erro
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import Gas
 
+OF_CURVES = ("dissipative_constant", "coefficient")
+"""Parameters that curves guess better than drop tests."""
+
 
 @dataclass(frozen=True)
 class Request:
@@ -54,11 +57,14 @@ def build_problem(request: Request) -> tuple[Problem, np.ndarray, list[str]]:
     fits_t0 = START_TIME in (*free, *prior_names)
     measurements: list[CurveRows | DropRows] = []
     guesses: dict[str, Gas] = {}
+    of_impacts: dict[str, Any] = {}
     notes: list[str] = []
     for label, m in request.measurements.items():
         if isinstance(m.data, DropTest):
             measurements.append(DropRows(label, m))
-            guesses[label] = guess_from_drops(m.gas, m.data, free)
+            values = guess_from_drops(m.gas, m.data, free)
+            guesses[label] = m.gas.replace(**values)
+            of_impacts |= {name: x for name, x in values.items() if name not in OF_CURVES}
             continue
         model.check_scene(m.gas if request.start is None else request.start)
         rows, more = curve_rows(label, m, model, fits_T_0="temperature" in free, fits_t0=fits_t0)
@@ -77,6 +83,8 @@ def build_problem(request: Request) -> tuple[Problem, np.ndarray, list[str]]:
         if isinstance(m, DropRows) and problem.curves:
             shared = guesses[problem.curves[0].label]
             guesses[m.label] = with_values_of(m.gas, shared, request.names)
+    for label, gas in guesses.items():  # and curves at what impacts alone tell
+        guesses[label] = gas.replace(**{n: x for n, x in of_impacts.items() if n in gas.domains})
     first = problem.flat(_values_of_guesses(problem, guesses))
     problem = problem_with_rate_errors(problem, first)
     if request.start is not None:

@@ -160,7 +160,10 @@ def twin(measurement: Measurement, truth: Truth = AS_GIVEN) -> Measurement:
     gas = truth.gas(measurement.gas)
     data = measurement.data
     if isinstance(data, DropTest):
-        return replace(measurement, data=replace(data, restitution=data.computed(gas)))
+        values = {"restitution": data.computed(gas)}
+        if data.is_oblique:
+            values["tangential_restitution"] = data.computed_tangential(gas)
+        return replace(measurement, data=replace(data, **values))
     N = measurement.num_particles
     faster = 1.0 if N is None else float(finite_size_cooling_factor(measurement.gas, float(N)))
     t0 = float(measurement.priors.get(START_TIME, (0.0, 0.0))[0])

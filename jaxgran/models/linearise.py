@@ -70,10 +70,15 @@ def with_neutral_elements(gas: Gas, model: AbstractModel) -> Gas:
     }
     if gas.diameter_sd is not None:
         added = {name: element for name, element in added.items() if name == "drag"}
-    gas = with_variant_law(gas)
-    if isinstance(gas.surface, Rough) and gas.surface.friction is None:
-        added["surface"] = dataclasses.replace(gas.surface, friction=STICKING)
-    return dataclasses.replace(gas, **added)
+    return dataclasses.replace(with_variant_law(with_coulomb_limit(gas)), **added)
+
+
+def with_coulomb_limit(gas: Gas) -> Gas:
+    """Return a gas whose rough spheres have a coefficient of friction, without effect if added."""
+    if not isinstance(gas.surface, Rough) or gas.surface.friction is not None:
+        return gas
+    surface = dataclasses.replace(gas.surface, friction=STICKING)
+    return dataclasses.replace(gas, surface=surface)
 
 
 def with_variant_law(gas: Gas) -> Gas:

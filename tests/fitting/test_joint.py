@@ -18,7 +18,7 @@ def drop_test(gas, key, num=20, error=0.005, onto_plate=False):
         # A plate doubles the effective radius and the effective mass.
         gas = gas.replace(youngs_modulus=gas.value("youngs_modulus") / np.sqrt(2))
     eps = gas.restitution(speed) + error * jax.random.normal(key, (num,))
-    return jaxgran.DropTest(speed, eps, jnp.full(num, error), onto_plate)
+    return jaxgran.DropTest(speed, eps, jnp.full(num, error), "plate" if onto_plate else "sphere")
 
 
 def of_drops(gas, test):
@@ -46,7 +46,7 @@ def test_a_restitution_that_is_flat_is_not_viscoelastic():
     """As golf balls bounce: eps is .895 at all speeds from 1.9 to 4 m/s."""
     speed = np.linspace(1.9, 4.0, 12)
     noise = 0.002 * np.array(jax.random.normal(jax.random.key(3), (12,)))
-    test = jaxgran.DropTest(speed, 0.895 + noise, np.full(12, 0.002), onto_plate=True)
+    test = jaxgran.DropTest(speed, 0.895 + noise, np.full(12, 0.002), onto="plate")
     gas = glass_beads(0.15).replace(dissipative_constant=0.0)  # as files give it
     result = jaxgran.fit(of_drops(gas, test))
     assert result.p_value < 1e-4 and result.value(A)[0] > 0

@@ -1,0 +1,157 @@
+"""Drop tests of oblique impacts in files."""
+
+import numpy as np
+import pytest
+
+import jaxgran
+from jaxgran import read_measurement
+from tests.beads import glass_beads
+
+ROUGH = jaxgran.Gas(
+    glass_beads().law,
+    diameter=2e-3,
+    mass=1e-5,
+    packing_fraction=0.05,
+    temperature=0.01,
+    surface=jaxgran.Rough(0.3, friction=0.2),
+    container=jaxgran.Walls(0.05, restitution=0.8, tangential_restitution=0.1),
+)
+SIGMA = 2e-3
+
+
+@pytest.fixture
+def drops_of(tmp_path):
+    """Read the drop test of a text."""
+
+    def read(text, **header):
+        (tmp_path / "drops.csv").write_text(text)
+        data = read_measurement(tmp_path / "drops.csv", header, gas=ROUGH).data
+        assert isinstance(data, jaxgran.DropTest)
+        return data
+
+    return read
+
+
+def test_each_kind_of_columns_gives_the_same_impacts(drops_of):
+    plain = drops_of("v_n,v_t,eps,eps_err,eps_t,eps_t_err\n0.3,0.4,0.9,0.01,0.2,0.02\n")
+    assert plain.is_oblique and plain.num_values == 2 and not plain.of_centres
+    tilt = np.degrees(np.arctan2(0.4, 0.3))
+    radians = f"50,{np.radians(tilt):.15g},.9,.01,.2,.02"
+    for text in (
+        f"v,angle,eps,eps_err,eps_t,eps_t_err\n0.5,{tilt:.15g},0.9,0.01,0.2,0.02\n",
+        f"v (cm/s),angle (rad),eps,eps_err,eps_t,eps_t_err\n{radians}\n",
+    ):
+        test = drops_of(text)
+        for name in ("speed", "tangential_speed", "restitution", "tangential_restitution"):
+            np.testing.assert_allclose(getattr(test, name), getattr(plain, name), rtol=1e-12)
+    centres = drops_of(
+        "v_n,v_n_err,v_t,eps,eps_err,eps_t_center,eps_t_center_err\n.3,.01,.4,.9,.01,.8,.02\n",
+        onto="plate",
+    )
+    assert centres.of_centres and centres.onto == "plate"
+    np.testing.assert_allclose(centres.speed_error, 0.01)
+
+
+def rough_impact(before, spin, normal, eps, beta_t, q=0.4):
+    """Velocity and spin of a sphere after an impact on a plate, by momentum and torque alone."""
+    u = before - SIGMA / 2 * np.cross(spin, normal)
+    along = (u @ normal) * normal
+    push = -(1 + eps) * along - q / (1 + q) * (1 + beta_t) * (u - along)
+    # The torque of the push at the contact, -(sigma/2) n, over q m sigma^2/4.
+    turn = np.cross(-SIGMA / 2 * normal, push) * 4 / (q * SIGMA**2)
+    return before + push, spin + turn
+
+
+def test_velocities_and_spins_give_both_restitutions(drops_of):
+    rng = np.random.default_rng(0)
+    normal = np.array([2.0, -1.0, 2.0]) / 3
+    before = np.array([-0.5, 0.3, -0.2])
+    head = "nx,ny,nz,vx,vy,vz,vx_after,vy_after,vz_after,v_err"
+    spins = "wx (rad/s),wy (rad/s),wz (rad/s)"
+    spins += ",wx_after (rad/s),wy_after (rad/s),wz_after (rad/s),w_err (rad/s)"
+    for spin in (np.zeros(3), 200 * rng.standard_normal(3)):
+        after, spin_after = rough_impact(before, spin, normal, 0.9, 0.3)
+        cells = [*normal, *before, *after, 1e-3, *spin, *spin_after, 1.0]
+        text = f"{head},{spins}\n{','.join(f'{x:.17g}' for x in cells)}\n"
+        test = drops_of(text, diameter="2 mm", onto="plate")
+        np.testing.assert_allclose(test.restitution, 0.9)
+        np.testing.assert_allclose(test.tangential_restitution, -0.3)
+    after, _ = rough_impact(before, np.zeros(3), normal, 0.9, 0.3)
+    text = f"{head}\n{','.join(f'{x:.17g}' for x in (*normal, *before, *after, 1e-3))}\n"
+    test = drops_of(text, spin_before=0, onto="plate")
+    assert test.of_centres
+    beta_t = dict(friction=1e6, tangential_restitution=0.3)
+    computed = test.computed_tangential(ROUGH.replace(**beta_t))
+    np.testing.assert_allclose(test.tangential_restitution, computed)
+
+
+def test_a_table_of_beta_t_is_asked_about(drops_of):
+    lines = [f"0.1,{0.05 * k},0.9,0.01,{0.9 - 0.15 * k:.3f},0.02" for k in range(1, 11)]
+    text = "\n".join(["v_n,v_t,eps,eps_err,eps_t,eps_t_err", *lines]) + "\n"
+    with pytest.warns(UserWarning, match="eps_t falls as .* is it beta_t = -eps_t"):
+        drops_of(text)
+
+
+OBLIQUE = "v_n,v_t,eps,eps_err,eps_t,eps_t_err\n"
+VELOCITIES = "nx,ny,nz,vx,vy,vz,vx_after,vy_after,vz_after,v_err"
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("v,eps,eps_err\n.1,1.3,.1\n", "line 2: eps is 1.3, allowed are 0 to 1.2"),
+        ("v,eps,eps_err\n.1,-.1,.1\n", "line 2: eps is -0.1, allowed are 0 to 1.2"),
+        (
+            "v,angle,eps,eps_err,eps_t,eps_t_err\n.1,95,.9,.1,.2,.1\n",
+            "line 2: angle is 95, allowed are 0 to 90. It is from the normal, in degrees",
+        ),
+        (OBLIQUE + ".1,.1,.9,.1,1.5,.1\n", "line 2: eps_t is 1.5, allowed are -1.1 to 1.1"),
+        (OBLIQUE + ".1,0,.9,.1,.5,.1\n", "tangential_speed must lie in .* normal impacts are"),
+        ("v_n,v_t,eps,eps_err,beta_t\n", "a column beta_t has the sign of the model: write eps_t"),
+        (
+            "v_n,v_t,eps,eps_err,eps_t,eps_t_err,eps_t_center\n",
+            "two definitions of the tangential restitution",
+        ),
+        ("v,eps,eps_err,eps_t\n", "have eps_t without the tangential speed: give v_n,v_t, or v,an"),
+        ("v_n,v_t,eps,eps_err\n", "name those of a drop test v_n,v_t,eps,eps_err,eps_t,eps_t_err"),
+        ("vx,vy,vz,vx_after,vy_after,vz_after,v_err\n", r"no normal \(nx, ny, nz\): add nx,ny,nz"),
+        (f"{VELOCITIES}\n0,0,1,0,0,-1,0,0,.9,.01\n", "if the spheres do not rotate .* spin_bef"),
+        (f"{VELOCITIES}\n0,0,2,0,0,-1,0,0,.9,.01\n", "the normal nx,ny,nz has the length 2"),
+        (
+            f"# spin_before: 0\n{VELOCITIES}\n0,0,1,0,0,1,0,0,.9,.01\n",
+            "vx,vy,vz lead away from the partner",
+        ),
+        (
+            f"{VELOCITIES},wx,wy,wz,wx_after,wy_after,wz_after,w_err\n"
+            "0,0,1,0,0,-1,0,0,.9,.01,0,0,0,0,0,0,1\n",
+            r"column wx is an angular velocity without a unit .* write wx \(rad/s\)",
+        ),
+        ("# onto: floor\nv,eps,eps_err\n.1,.9,.1\n", "must be one of sphere, plate, wall, got 'fl"),
+    ],
+)
+def test_bad_impacts_are_refused(drops_of, text, message):
+    with pytest.raises(ValueError, match=message):
+        drops_of(text)
+
+
+def test_speeds_in_another_unit_are_asked_about(drops_of):
+    with pytest.warns(UserWarning, match=r"v_n is 30 m/s, .* is it in cm/s\? Then write v_n \(cm"):
+        drops_of(OBLIQUE + "30,1,.9,.1,.2,.1\n")
+
+
+def test_impacts_need_the_elements_on_which_they_depend():
+    smooth = glass_beads()
+    oblique = jaxgran.DropTest(
+        [0.1], [0.9], [0.01], tangential_speed=[0.1], tangential_restitution=[0.2],
+        tangential_error=[0.01],
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="eps_t needs rough spheres .* `beta_t: guess`"):
+        jaxgran.Measurement(smooth, oblique)
+    with pytest.raises(ValueError, match="impacts onto a wall need the walls of the gas"):
+        jaxgran.Measurement(smooth, jaxgran.DropTest([0.1], [0.9], [0.01], "wall"))
+    with pytest.raises(ValueError, match="onto must be one of sphere, plate, wall, got True"):
+        jaxgran.DropTest([0.1], [0.9], [0.01], True)
+    with pytest.raises(ValueError, match="are given together, got tangential_speed"):
+        jaxgran.DropTest([0.1], [0.9], [0.01], tangential_speed=[0.1])
+    wall = jaxgran.DropTest([0.1], [0.9], [0.01], "wall")
+    assert float(wall.computed(jaxgran.Measurement(ROUGH, wall).gas)[0]) == pytest.approx(0.8)
