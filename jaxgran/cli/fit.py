@@ -7,6 +7,7 @@ import dataclasses
 import json
 import os
 import platform
+import tempfile
 import time
 import warnings
 from collections.abc import Sequence
@@ -20,13 +21,20 @@ import numpy as np
 import jaxgran
 from jaxgran import plotting
 from jaxgran.cli.common import FitOptions, models_by_name
-from jaxgran.cli.page import command_of, question_of, sections_of_fit, write_page
+from jaxgran.cli.page import (
+    Section,
+    command_of,
+    question_of,
+    sections_of_fit,
+    sections_of_plan,
+    write_page,
+)
 from jaxgran.data.curve import import_extra
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.files import name_in_errors
 from jaxgran.data.header import OPTIONAL_KEYS, PRIOR_KEYS, absent_of_header
 from jaxgran.data.tables import UNIT_KEYS, header_in_si
-from jaxgran.fitting.messages import SIGNIFICANCE
+from jaxgran.fitting.messages import NOT_DETERMINED, SIGNIFICANCE
 from jaxgran.fitting.report import parameter_rows, report
 from jaxgran.models.choose import default_models
 from jaxgran.scene.parameters import BY_SYMBOL, SCENE
@@ -93,6 +101,8 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
     if options.report:
         page = record.with_suffix(".html")
         sections = sections_of_fit(result, picture if picture in written else None)
+        if is_single and paths and result.grade == NOT_DETERMINED and not options.quick:
+            sections[1:1] = what_to_measure_next(result)
         question = question_of(result.names[0], "fit")
         title = ", ".join(path.stem.replace("_", " ") for path in files)
         write_page(page, title, question, result.headline, sections, command_of("fit", files))
@@ -102,6 +112,18 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
         print(f"\n{imitation}")
     print("\nwritten  " + "\n         ".join(map(str, written)) + "\n")
     print(json.dumps(summary, allow_nan=False))
+
+
+def what_to_measure_next(result: jaxgran.Fit) -> list[Section]:
+    """Return the part of a page with a plan that starts at a fit; none if N is not known."""
+    measurement = result.measurements[""]
+    if measurement.num_particles is None:
+        return []
+    planned = jaxgran.plan(measurement, free=result.names)
+    with tempfile.TemporaryDirectory() as folder:
+        picture = Path(folder) / "plan.png"
+        plotting.save_plan(planned, planned.headline, picture)
+        return sections_of_plan(planned, picture, "What to measure next")
 
 
 def read_all(paths: Sequence[Path], options: FitOptions) -> dict[str, jaxgran.Measurement]:

@@ -85,12 +85,10 @@ def sections_of_fit(result: Fit, picture: Path | None) -> list[Section]:
     return sections
 
 
-def sections_of_plan(planned: Plan, picture: Path) -> list[Section]:
+def sections_of_plan(planned: Plan, picture: Path, title: str = "What to measure") -> list[Section]:
     """Return the parts of a page on what to measure."""
     head, rows = planned.table
-    return [
-        Section("What to measure", planned.notes, head, rows, _encoded(picture)),
-    ]
+    return [Section(title, planned.notes, head, rows, _encoded(picture))]
 
 
 def question_of(parameter: str, kind: str) -> str:

@@ -16,6 +16,7 @@ from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.header import ABSENT
 from jaxgran.data.measurement import Measurement
+from jaxgran.scene.elements import Rough
 
 CURVE = "curve"
 """Label of the planned curve among several measurements."""
@@ -49,6 +50,12 @@ NUM_IMPACTS = 20
 
 IMPACT_ERROR = 0.01
 """Standard error of eps of one impact."""
+
+TANGENTIAL_ERROR = 0.02
+"""Standard error of eps_t of one impact."""
+
+IMPACT_ANGLES = (10.0, 75.0)
+"""Smallest and largest angle of oblique impacts from the normal, degrees."""
 
 IMPACT_SPEEDS = (0.3, 3.0)
 """Slowest and fastest impact, over the thermal speed sqrt(2 T) of the start."""
@@ -117,6 +124,13 @@ def standard_candidates(measurement: Measurement) -> list[Candidate]:
             f"{NUM_IMPACTS} normal impacts",
             f"eps of each impact to +-{IMPACT_ERROR:g}, at {_impact_speeds(measurement)}",
             with_impacts,
+            "impacts",
+        ),
+        Candidate(
+            f"{NUM_IMPACTS} oblique impacts",
+            f"eps to +-{IMPACT_ERROR:g}, eps_t to +-{TANGENTIAL_ERROR:g}, at "
+            f"{IMPACT_ANGLES[0]:g} to {IMPACT_ANGLES[1]:g} degrees from the normal",
+            with_oblique_impacts,
             "impacts",
         ),
         *(
@@ -237,6 +251,25 @@ def with_impacts(measurement: Measurement) -> dict[str, Measurement] | None:
     eps = np.full(NUM_IMPACTS, 0.9)
     drops = DropTest(speed, eps, np.full(NUM_IMPACTS, IMPACT_ERROR))
     return {CURVE: measurement, "impacts": Measurement(gas, drops)}
+
+
+def with_oblique_impacts(measurement: Measurement) -> dict[str, Measurement] | None:
+    """Return the curve, and a drop test of oblique impacts of two rough grains."""
+    gas = measurement.gas
+    if not isinstance(gas.surface, Rough):
+        return None
+    thermal = float(np.sqrt(2 * gas.temperature))
+    speed = np.full(NUM_IMPACTS, thermal)
+    angle = np.radians(np.linspace(*IMPACT_ANGLES, NUM_IMPACTS))
+    drops = DropTest(
+        speed * np.cos(angle),
+        np.full(NUM_IMPACTS, 0.9),
+        np.full(NUM_IMPACTS, IMPACT_ERROR),
+        tangential_speed=speed * np.sin(angle),
+        tangential_restitution=np.zeros(NUM_IMPACTS),
+        tangential_error=np.full(NUM_IMPACTS, TANGENTIAL_ERROR),
+    )
+    return {CURVE: measurement, "oblique impacts": Measurement(gas, drops)}
 
 
 def with_absence(measurement: Measurement, effect: str) -> Measurement | None:
