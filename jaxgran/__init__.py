@@ -26,6 +26,7 @@ from jaxgran.data.curve_file import read_curve as read_curve
 from jaxgran.data.curve_file import write_curve as write_curve
 from jaxgran.data.drop_test import DropTest as DropTest
 from jaxgran.data.example import example_measurement as example_measurement
+from jaxgran.data.lammps import lammps_commands as lammps_commands
 from jaxgran.data.measurement import Measurement as Measurement
 from jaxgran.data.measurement import read_measurement as read_measurement
 from jaxgran.data.particles import read_particles as read_particles

