@@ -122,11 +122,16 @@ def claims_hold(found):
     assert all(row["holds"] for row in found["rows"])
 
 
+def error_bars_hold_the_surface(found):
+    assert found["runs"] == 10 and min(found["held"].values()) >= 7
+
+
 OF_IMPACTS, MEMORY = "--only paper_restitution --smoke", "--only paper_velocity_correlation --smoke"
 SCRIPTS = {
     "fit/sample_posterior": ("--samples 300 --warmup 150", is_the_budgets, "png"),
     "fit/drop_tower": ("--runs 1", holds_A, "png"),
     "fit/wrong_physics": ("--runs 3 --rows 'walls, eps'", is_right_where_walls_are_told, ""),
+    "fit/impacts": ("--only oblique --runs 2", error_bars_hold_the_surface, ""),
     "fit/plan": ("--runs 3 --rows smooth", expects_the_widths_of_runs, "png"),
     "fit/fit_head_to_head": ("--smoke --only fit_head_to_head", finds_A, ""),
     "speed/benchmark_theory": ("--smoke --only benchmark_kinetic_theory", is_the_same_twice, ""),
