@@ -46,6 +46,7 @@ def lammps_commands(gas: Gas, diameters: Sequence[float] | None = None) -> str:
     >>> print(jaxgran.lammps_commands(gas).splitlines()[2])
     pair_style granular
     """
+    gas.check_single()
     law = gas.law
     if not isinstance(law, Viscoelastic):
         raise ValueError(
