@@ -42,7 +42,7 @@ SPIN_BEFORE = "spin_before"
 
 
 def is_drop_test(names: list[str]) -> bool:
-    """Return whether columns are those of a drop test, of any kind."""
+    """Return whether columns belong to a drop test, of any kind."""
     known = {"eps", "beta_t", *OF_SURFACES, *OF_CENTRES, *AFTER}
     return not known.isdisjoint(names)
 
@@ -112,8 +112,8 @@ def drop_test_of_table(table: Table) -> tuple[DropTest, list[str]]:
     """Return the drop test of a table, and questions about it.
 
     Args:
-        table: with the columns of `drop_test_columns`. Velocities are those of a sphere relative
-            to its partner, spins the sum of both angular velocities (a plate has none), and the
+        table: with the columns of `drop_test_columns`. Velocities are of a sphere relative to its
+            partner, spins the sum of both angular velocities (a plate has none), and the
             normal n points from the partner to the sphere. ``u = v - (sigma/2) w x n`` is then the
             velocity of the surfaces at contact; ``eps = -u_n'/u_n``, and eps_t is the part of u_t'
             along u_t, over |u_t|. The header has ``diameter`` where there are spins. Without

@@ -342,7 +342,7 @@ class _Events(NamedTuple):
         normal: unit vector away from a wall, shape (n, d); 0 of spheres.
         time: of the encounter, s.
         half_width: frames on each side of this time that may lie on the other side of the impact.
-        tolerance: largest difference of the time of an impact from that of the encounter, s.
+        tolerance: largest difference of the times of an impact and of its encounter, s.
         is_break: whether it may have changed the velocities.
     """
 

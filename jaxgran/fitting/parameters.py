@@ -141,8 +141,8 @@ def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
 def guess_from_drops(gas: Gas, test: DropTest, free: tuple[str, ...]) -> dict[str, Any]:
     """Return guesses of free parameters on which the impacts of a drop test depend, by name.
 
-    A is that of ``eps = exp(-C1 beta)`` of the median impact, a constant restitution the median
-    one, and beta_t and mu are those of oblique impacts (`_guess_tangential`).
+    A follows from ``eps = exp(-C1 beta)`` of the median impact, and a constant restitution is the
+    median one. Oblique impacts give beta_t and mu (`_guess_tangential`).
     """
     values: dict[str, Any] = {}
     eps = np.clip(np.median(np.asarray(test.restitution)), 1e-3, 0.999)

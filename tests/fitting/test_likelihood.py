@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import jaxgran
+from jaxgran.fitting.likelihood import SAMPLE_MEMORY, Nodes, filtered
 from jaxgran.fitting.prediction import predicted_curve
-from jaxgran.fitting.rows import curve_rows
+from jaxgran.fitting.rows import Noise, curve_rows
 from jaxgran.fitting.search import minimise
 from jaxgran.fitting.setup import Request, build_problem, problem_with_rate_errors
 from tests.beads import glass_beads
@@ -101,3 +102,27 @@ def test_likelihoods_that_cannot_be():
         jaxgran.log_likelihood(gas, jaxgran.Measurement(gas, curve), model=jaxgran.DSMC(100))
     with pytest.raises(ValueError, match="must be a jaxgran.Measurement"):
         jaxgran.log_likelihood(gas, curve)
+
+
+def test_the_error_of_a_sample_of_grains_is_remembered():
+    # A Gaussian process of the covariance S exp(-k |tau_i - tau_j|), and nothing else.
+    size = 12
+    variance = 0.01
+    tau = np.geomspace(0.1, 6.0, size)
+    values = 0.1 * np.random.default_rng(0).standard_normal(size)
+    column = np.zeros((size, 1))
+    nodes = Nodes(tau, column, column, column[:, 0], tau[:, None])
+    noise = Noise(np.zeros(1), 0.0, np.zeros(size), variance, 0.0)
+    residuals = np.zeros((size, 2, 1, 1))
+    residuals[:, 0, 0, 0] = values
+    used = np.repeat([[1.0, 0.0]], size, axis=0)
+    gas = jax.tree.map(lambda x: x[None], glass_beads())
+    arguments = nodes, residuals, np.zeros((size, 2, 1)), column + 1, used, noise
+    found, spread = filtered(gas, *jax.tree.map(jnp.asarray, arguments))
+    innovation, of_innovation = (np.asarray(x)[:, 0].ravel() for x in (found, spread))
+    covariance = variance * np.exp(-SAMPLE_MEMORY * np.abs(tau[:, None] - tau))
+    square = values @ np.linalg.solve(covariance, values)
+    # The filter adds a variance of 1e-12 to each value.
+    assert np.sum(innovation**2 / of_innovation) == pytest.approx(square, rel=1e-8)
+    determinant = np.linalg.slogdet(covariance)[1]
+    assert np.sum(np.log(of_innovation)) == pytest.approx(determinant, rel=1e-8)
