@@ -3,10 +3,7 @@
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from jaxgran._utils import status
 from jaxgran._utils.tracing import as_jax_arrays
@@ -33,6 +30,7 @@ from jaxgran.fitting.rows import SCATTER, TINY, CurveRows
 from jaxgran.fitting.search import Descent, Minimum, best_of_starts, minimise
 from jaxgran.fitting.setup import Request, build_problem, problem_with_rate_errors
 from jaxgran.models.checks import describe_walls
+from jaxgran.models.scales import scales_at
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.parameters import symbol_of
 
@@ -271,30 +269,19 @@ def describe_gas(gas: Gas, m: CurveRows) -> dict[str, float]:
     """Return numbers that describe a fitted gas: see `Fit.scales`."""
     N = m.measurement.num_particles
     coolest = m.values[above_noise(m.curve), 0][-1]
-    # An array: a number of Python would be a constant of a program of its own.
-    numbers = _scales(gas, jnp.asarray(coolest))
-    scales = {name: float(x) for name, x in numbers.items()}
-    volume = scales.pop("volume")
-    side = float("nan") if N is None else (N * volume) ** (1 / gas.dimension)
-    return scales | {"side": side}
-
-
-@eqx.filter_jit
-def _scales(gas: Gas, last: Array) -> dict[str, Array]:
-    speeds = jnp.sqrt(2 * jnp.stack([gas.temperature, last]))
-    first, at_last = gas.restitution(speeds)
-    scales = {
-        "phi": gas.packing_fraction,
-        "tau_c": gas.mean_free_time,
-        "contact_fraction": gas.contact_fraction,
-        "eps_first": first,
-        "eps_last": at_last,
-        "mean_free_path": gas.mean_free_path,
-        "volume": 1 / gas.number_density,
+    first = scales_at(gas)
+    described = {
+        "phi": float(gas.packing_fraction),
+        "tau_c": float(first.mean_free_time),
+        "contact_fraction": float(first.contact_fraction),
+        "eps_first": float(first.restitution),
+        "eps_last": float(scales_at(gas, coolest).restitution),
+        "mean_free_path": float(first.mean_free_path),
+        "side": float("nan") if N is None else first.box_side(N, gas.dimension),
     }
-    if hasattr(gas.law, "dissipative_constant"):
-        scales["beta"] = gas.thermal_beta
-    return scales
+    if np.isfinite(first.beta):
+        described["beta"] = float(first.beta)
+    return described
 
 
 def with_messages(

@@ -24,6 +24,7 @@ from jaxgran.models.linearise import (
     with_neutral_elements,
     with_variant_law,
 )
+from jaxgran.models.scales import scales_at
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.gas import Gas
 
@@ -356,7 +357,7 @@ def curve_rows(
         scatter=1 / total,
         scatter_error=WEAK_SCATTER if N is None else SCATTER_ERROR,
         faster=1.0 if N is None else float(finite_size_cooling_factor(gas, float_array(N))),
-        unit_time=float(gas.mean_free_time),
+        unit_time=float(scales_at(gas).mean_free_time),
         rate_error=(np.zeros(1), np.zeros(1)),
         rotation_accuracy=float(model.rotation_accuracy(gas)) if uses_rotation else 0.0,
         displacement=None if fits_t0 else _displacement(measurement, model),

@@ -8,17 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced, is_known, known_part, nan_where
 from jaxgran.data.curve import CoolingCurve, Run
 from jaxgran.models.base import AbstractModel, Limitation
+from jaxgran.models.scales import scales_at
 from jaxgran.scene.elements import VOLUME_TOLERANCE, container_volume_ratio
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.geometry import MIN_BOX, NODES, PACKING_LIMIT
-from jaxgran.theory.averages import impact_moments
-from jaxgran.theory.equations import max_thermal_speed, softness_factor
+from jaxgran.scene.geometry import MIN_BOX, PACKING_LIMIT
+from jaxgran.theory.equations import max_thermal_speed
 
 CONTACT_LIMIT = 0.03
 """Contact duration over mean free time above which impacts are not instantaneous and binary."""
@@ -75,61 +75,44 @@ def checked_key(key: Any) -> PRNGKeyArray | None:
     raise ValueError(f"key must be a key such as jax.random.key(5), got {key!r:.60}")
 
 
-MAX_CHECKED_SPEED = 3.7
-"""Normal speed, over sqrt(2 T), that a thousandth of the impacts of a gas exceed."""
-
-
-def check_cools(rate: ArrayLike, lowest: ArrayLike) -> None:
-    """Raise ValueError for a law with eps < 0, or one that heats: see `first_cooling_rate`."""
-    if isinstance(rate, Tracer):
+def check_cools(gas: Gas) -> None:
+    """Raise ValueError for a law with eps < 0, or one that heats, in a gas of known numbers."""
+    if any_traced(gas):
         return
-    if not np.all(np.asarray(lowest) >= 0):
+    scales = scales_at(gas)
+    if not scales.lowest_restitution >= 0:
         raise ValueError(
-            f"the law of restitution gives eps = {float(np.min(lowest)):.3g} at a speed of impacts "
-            "in this gas, but eps must be a number >= 0: limit it, as in jnp.clip(eps, 0.0, 1.0), "
-            "or lower T_0"
+            f"the law of restitution gives eps = {scales.lowest_restitution:.3g} at a speed of "
+            "impacts in this gas, but eps must be a number >= 0: limit it, as in "
+            "jnp.clip(eps, 0.0, 1.0), or lower T_0"
         )
-    if np.any(np.asarray(rate) < 0):
+    if scales.cooling_rate < 0:
         raise ValueError(
             "the law of restitution makes this gas heat up: its mean eps over impacts is above 1 "
             "(a truncated series beyond its range). Lower T_0 or A, or use another law."
         )
 
 
-@eqx.filter_jit
-def first_cooling_rate(gas: Gas) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return ``-d ln T/dt`` at t = 0, 1/s, of a Maxwellian gas, and eps at its lowest.
-
-    The rate is negative if the law heats the gas; eps is that at speeds to `MAX_CHECKED_SPEED`.
-    """
-    one = jnp.ones_like(gas.temperature)
-    law = gas.reduced_law
-    mu_2 = impact_moments(law, one, gas.dimension)[0, 0]
-    speeds = jnp.asarray(NODES[NODES < MAX_CHECKED_SPEED], one.dtype)
-    rate = 2 / gas.dimension * mu_2 * gas.impact_speed / gas.path_length
-    return rate, jnp.min(law.restitution(speeds))
+def check_softness(gas: Gas) -> None:
+    """Raise ValueError if soft contacts would stop the cooling, at T_0 or at the highest T."""
+    hottest = 1.0 if gas.drive is None else float(_max_thermal_speed(gas))
+    highest = float(gas.temperature) * hottest**2
+    check_softness_at(gas, hottest, float(scales_at(gas, highest).softness))
 
 
-@eqx.filter_jit
-def initial_cooling(gas: Gas) -> tuple[tuple[Array, Array], Array, Array]:
-    """Return `first_cooling_rate`, and at the highest T the softness factor and sqrt(T/T_0)."""
-    one = jnp.ones_like(gas.temperature)
-    hottest = one if gas.drive is None else max_thermal_speed(gas)
-    factor = softness_factor(gas.reduced_law, hottest, gas.dimension)
-    return first_cooling_rate(gas), factor, hottest
+_max_thermal_speed = eqx.filter_jit(max_thermal_speed)
 
 
-def check_softness(gas: Gas, factor: ArrayLike, hottest: ArrayLike = 1.0) -> None:
-    """Raise ValueError if the factor by which soft contacts slow the cooling is not positive.
+def check_softness_at(gas: Gas, speed: float, softness: float) -> None:
+    """Raise ValueError if soft contacts would stop the cooling.
 
     Args:
         gas: the scene.
-        factor: the factor at the highest temperature.
-        hottest: sqrt(T/T_0) at the highest temperature.
+        speed: sqrt(T/T_0) at the highest temperature.
+        softness: c X_T/sigma there.
     """
-    if not isinstance(factor, Tracer) and np.any(np.asarray(factor) <= 0):
-        speed = float(np.max(np.asarray(hottest)))
-        overlap = float(np.max(gas.mean_overlap)) * speed**0.8
+    if softness >= 1:
+        overlap = float(scales_at(gas).overlap) * speed**0.8
         place = "T_0" if speed == 1 else f"{speed**2:.3g} T_0, to which the gas heats up"
         raise ValueError(
             f"spheres overlap by {overlap:.2g} diameters at {place}, where the softness "
@@ -196,19 +179,17 @@ def limitations_of_instant_impacts(
         consequence: the relative clause about overlaps that are not small.
     """
     effects = []
-    duration, overlap, _ = map(float, _contact_and_box(gas))
-    if duration > CONTACT_LIMIT:
+    scales = scales_at(gas)
+    if scales.contact_fraction > CONTACT_LIMIT:
         effects.append(
-            f"contacts last {duration:.2g} of the mean free time, so spheres meet three at a time"
+            f"contacts last {scales.contact_fraction:.2g} of the mean free time, so spheres meet "
+            "three at a time"
         )
-    if overlap > OVERLAP_LIMIT:
-        effects.append(f"spheres overlap by {100 * overlap:.2g} % of a diameter, {consequence}")
+    if scales.overlap > OVERLAP_LIMIT:
+        effects.append(
+            f"spheres overlap by {100 * scales.overlap:.2g} % of a diameter, {consequence}"
+        )
     return tuple(Limitation(words, True, SOFT_SPHERES_NEEDED) for words in effects)
-
-
-@eqx.filter_jit
-def _contact_and_box(gas: Gas) -> tuple[Array, Array, Array]:
-    return gas.contact_fraction, gas.mean_overlap, gas.critical_box
 
 
 def limitations_of_homogeneity(gas: Gas, num_particles: int | None) -> tuple[Limitation, ...]:
@@ -226,8 +207,9 @@ def limitations_of_homogeneity(gas: Gas, num_particles: int | None) -> tuple[Lim
             f"the packing fraction {phi:.2g} is above {limit:g}, where successive collisions are "
             "correlated"
         )
+    scales = scales_at(gas)
     if gas.container is not None:
-        side = float(np.min(gas.container.side) / gas.mean_free_path)
+        side = float(np.min(gas.container.side) / scales.mean_free_path)
         if side > MAX_WALL_DISTANCE:
             effects.append(
                 f"walls are {side:.2g} mean free paths apart, and the gas is taken as mixed, which "
@@ -235,8 +217,8 @@ def limitations_of_homogeneity(gas: Gas, num_particles: int | None) -> tuple[Lim
             )
     elif num_particles is not None:
         diameter = float(gas.diameter)
-        box = float(gas.box_side(num_particles))
-        critical = float(_contact_and_box(gas)[2])
+        box = scales.box_side(num_particles, gas.dimension)
+        critical = float(scales.critical_box)
         if box > critical:
             effects.append(
                 f"the box, {box / diameter:.3g} diameters, is above "
@@ -263,7 +245,8 @@ def describe_walls(gas: Gas, num_particles: int) -> str:
     A sphere of mean speed <v> meets walls ``2 d/L <|v_x|>/2`` times a second, with
     ``<|v_x|>/<v> = 1/2`` (2/pi in a plane).
     """
-    long = float(gas.box_side(num_particles) / gas.mean_free_path)
+    scales = scales_at(gas)
+    long = scales.box_side(num_particles, gas.dimension) / float(scales.mean_free_path)
     if gas.container is not None:
         return f"has walls, {long:.2g} mean free paths apart"
     often = gas.dimension / long * {2: 2 / np.pi, 3: 0.5}[gas.dimension]

@@ -5,20 +5,18 @@ from collections.abc import Sequence
 from math import hypot
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import ArrayLike
 
 from jaxgran._utils import status
 from jaxgran._utils.formatting import text_table
-from jaxgran._utils.tracing import any_traced, grid_size, pad_to
+from jaxgran._utils.tracing import any_traced
 from jaxgran._utils.validation import POSITIVE, checked_float, checked_times
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import (
-    check_softness,
+    check_softness_at,
     check_volume,
     checked_gas,
     describe_walls,
@@ -28,9 +26,9 @@ from jaxgran.models.error_model import ErrorModel, flow_share
 from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.linearise import curve_of_program
+from jaxgran.models.scales import scales_at
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.scene.gas import Gas
-from jaxgran.theory.equations import softness_factor
 
 NUM_PARTICLES = 4000
 """Particles of a particle model if the user gives no number."""
@@ -187,14 +185,14 @@ def error_model_of(gas: Gas, end: float, num_particles: int | None = None) -> Er
         ValueError: for a gas so soft that the softness correction is invalid.
         RuntimeError: if kinetic theory cannot reach the end.
     """
-    mean_free_time = float(gas.mean_free_time)
+    mean_free_time = float(scales_at(gas).mean_free_time)
     grid = np.linspace(0, np.log1p(end / mean_free_time), NUM_TIMES)
     known = dataclasses.replace(gas, surface=None) if "friction" in gas.elements else gas
     curve = curve_of_program(KineticTheory(), known, np.expm1(grid) * mean_free_time)
     error_model = error_model_along(gas, curve, num_particles)
     softest = int(np.argmax(error_model.softness))
     hottest = np.exp(error_model.log_temperature[softest] / 2)
-    check_softness(gas, 1 - error_model.softness[softest], hottest)
+    check_softness_at(gas, hottest, float(error_model.softness[softest]))
     fault = int(jnp.asarray(curve.status))
     if fault != status.OK:
         raise RuntimeError(f"kinetic theory, which estimates the errors: {status.explain(fault)}")
@@ -216,30 +214,15 @@ def error_model_along(
         "collisions": zero if curve.collisions is None else curve.collisions,
         "sonine": zero if curve.sonine is None else curve.sonine,
     }
-    size = temperature.size
-    scales = _scales(gas, pad_to(temperature, grid_size(size)))
-    scales = {name: np.asarray(value)[:size] for name, value in scales.items()}
-    values = {name: np.asarray(value, float) for name, value in (values | scales).items()}
-    critical, flow = values.pop("critical_box"), np.zeros_like(values["time"])
-    scatter = flow
+    scales = scales_at(gas, temperature)
+    for name in ("contact_fraction", "overlap", "softness"):
+        values[name] = getattr(scales, name)
+    values = {name: np.asarray(value, float) for name, value in values.items()}
+    flow = scatter = np.zeros_like(values["time"])
     if num_particles is not None:
+        critical = np.asarray(scales.critical_box, float)
         flow, scatter = flow_share(gas, values["log_temperature"], critical, num_particles)
     return ErrorModel(gas, num_particles, **values, flow_share=flow, flow_scatter=scatter)
-
-
-@eqx.filter_jit
-def _scales(gas: Gas, temperature: Float[Array, "times"]) -> dict[str, Float[Array, "times"]]:
-    def scales(temperature):
-        now = gas.replace(temperature=temperature)
-        factor = softness_factor(now.reduced_law, jnp.ones_like(temperature), now.dimension)
-        return {
-            "contact_fraction": now.contact_fraction,
-            "overlap": now.mean_overlap,
-            "softness": 1 - factor,
-            "critical_box": now.critical_box,
-        }
-
-    return jax.vmap(scales)(temperature)
 
 
 def _describe_scene(error_model: ErrorModel, size: int, replicas: int) -> list[str]:
@@ -270,7 +253,9 @@ def _describe_box(error_model: ErrorModel) -> str:
             f"{text} the error of kinetic theory is {error} if the gas stays homogeneous; without "
             "num_particles the box is unknown, and clustering is not estimated."
         )
-    ratio = float(gas.box_side(error_model.num_particles) / gas.critical_box)
+    scales = scales_at(gas)
+    side = scales.box_side(error_model.num_particles, gas.dimension)
+    ratio = side / float(scales.critical_box)
     later = " Clusters follow the flow (see Gas.critical_box)." if ratio > 1 else ""
     return (
         f"{text} in a box of {ratio:.2g} L_c, where the flow reaches "

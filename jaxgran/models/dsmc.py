@@ -94,7 +94,7 @@ class DSMC(AbstractParticleModel):
 
     def check(self, gas: Gas) -> None:
         """Raise ValueError if the law of restitution heats the gas."""
-        checks.check_cools(*checks.first_cooling_rate(gas))
+        checks.check_cools(gas)
 
     def estimated_error(self, error_model: ErrorModel) -> float:
         """Estimated relative error of T by `rate_error` and the shot noise of all replicas."""

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxgran.models.scales import scales_at
 from jaxgran.scene.gas import Gas
 
 A = TypeVar("A", Array, np.ndarray)
@@ -217,7 +218,10 @@ class ErrorModel(NamedTuple):
         is 0 in boxes below L_c.
         """
         gas, n = self.gas, self.num_particles
-        if n is None or float(gas.box_side(n)) <= float(gas.critical_box):
+        if n is None:
+            return np.zeros(self.time.shape)
+        scales = scales_at(gas)
+        if scales.box_side(n, gas.dimension) <= scales.critical_box:
             return np.zeros(self.time.shape)
         return slope_bias(self.clock_error(MEASURED_FLOW * MISSING_HEAT * self.flow_share))
 
@@ -352,7 +356,8 @@ def flow_share(
 
     Reference: van Noije, Ernst, Brito & Orza, Phys. Rev. Lett. 79, 411 (1997).
     """
-    q_of_longest = (critical_box / float(gas.box_side(num_particles))) ** 2
+    side = scales_at(gas).box_side(num_particles, gas.dimension)
+    q_of_longest = (critical_box / side) ** 2
     longest = sqrt(1 / q_of_longest.min())
     if longest * sqrt(MAX_WAVENUMBER_SQUARED) < 1:
         zero = np.zeros_like(q_of_longest)

@@ -132,7 +132,7 @@ class HardSpheres(AbstractSpheres):
             ValueError: for a law that heats the gas, a gas too dense, a box too small, or a start
                 with spheres that overlap.
         """
-        checks.check_cools(*checks.first_cooling_rate(gas))
+        checks.check_cools(gas)
         with jax.ensure_compile_time_eval():
             self.check_box(gas, 0.5 - ALLOWED_OVERLAP)
             self._check_overlap(gas)

@@ -1,7 +1,7 @@
 """Kinetic theory of a homogeneous gas: seven ordinary differential equations."""
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -21,6 +21,7 @@ from jaxgran.data.curve import DEFAULTS, CoolingCurve, Run
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.error_model import ErrorModel
+from jaxgran.models.scales import first_cooling_rate
 from jaxgran.scene.gas import Gas, reduced_scene
 from jaxgran.theory.covariance import run_covariance
 from jaxgran.theory.equations import (
@@ -47,6 +48,13 @@ MAX_SEARCHED_SPREAD = 0.3
 
 SLIDING_ACCURACY = 0.2
 """Relative accuracy of T_rot/T of spheres that slide and rotated at t = 0, or have rough walls."""
+
+
+class ReducedUnits(NamedTuple):
+    """Units of `jaxgran.theory.averages` in SI: `Gas.path_length` and `Gas.impact_speed`."""
+
+    length: Float[Array, ""]
+    speed: Float[Array, ""]
 
 
 class KineticTheory(AbstractModel):
@@ -183,15 +191,15 @@ class KineticTheory(AbstractModel):
         """
         if gas.container is not None or gas.diameter_sd is not None:
             return None
-        correlation = 0.85 * jnp.minimum(gas.packing_fraction, 0.2)
+        correlation = 0.85 * np.minimum(gas.packing_fraction, 0.2)
         sonine = 0.005 if self.order > 2 and self.sonine else {2: 0.024, 3: 0.017}[gas.dimension]
         if gas.surface is not None:  # spins and velocities are correlated: DSMC, beta_t = .5
             sonine += 0.07
-        return jnp.hypot(sonine, correlation)
+        return np.hypot(sonine, correlation)
 
     def cooling_rate(self, gas: Gas) -> Float[Array, ""]:
         """Return ``-d ln T/dt`` at t = 0, 1/s, of a Maxwellian gas; < 0 if the law heats it."""
-        return checks.first_cooling_rate(gas)[0]
+        return first_cooling_rate(gas)
 
     def covariance(
         self,
@@ -262,9 +270,7 @@ class KineticTheory(AbstractModel):
         shares = jnp.linspace(0.0, 1.0, NUM_GRID_TIMES, dtype=times.dtype)
         between = jnp.expm1(shares * jnp.log1p(frequency * times[-1])) / frequency
         grid = jnp.sort(jnp.concatenate([times, between]))
-        scene, reduced = self._reduced(gas, grid)
-        state, fault = self._solver(gas, grid, 1.0).moments(scene, reduced)
-        curve = self._curve(gas, grid, state, fault)
+        curve, state = self._curve_and_moments(gas, grid, 1.0)
         options = {"softness": self.softness, "correlations": self.correlations}
         whole = run_covariance(gas, curve, state.spins, rotation=rotation, energy=energy, **options)
         rows = jnp.searchsorted(grid, times)
@@ -286,10 +292,9 @@ class KineticTheory(AbstractModel):
         gas.check_sizes()
         if any_traced(gas):
             return
-        rate, factor, hottest = checks.initial_cooling(gas)
         if self.softness:
-            checks.check_softness(gas, factor, hottest)
-        checks.check_cools(*rate)
+            checks.check_softness(gas)
+        checks.check_cools(gas)
 
     def estimated_error(self, error_model: ErrorModel) -> float:
         """Estimated relative error of T, which follows from `rate_error`."""
@@ -344,9 +349,17 @@ class KineticTheory(AbstractModel):
 
     def solve(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> CoolingCurve:
         """Return the curve at times on a grid of lengths; <dr^2> as if there were no walls."""
-        scene, reduced = self._reduced(gas, times)
-        state, fault = self._solver(gas, times, tolerance).moments(scene, reduced)
-        return self._curve(gas, times, state, fault)
+        curve, _ = self._curve_and_moments(gas, times, tolerance)
+        return curve
+
+    def _curve_and_moments(
+        self, gas: Gas, times: Float[Array, "times"], tolerance: Any
+    ) -> tuple[CoolingCurve, Moments]:
+        sound = self._is_sound(gas)
+        scene, reduced, units = self._reduced(gas, times, sound)
+        moments, fault = self._solver(gas, times, tolerance).moments(scene, reduced)
+        fault |= status.flag(status.UNSUPPORTED, ~sound)
+        return self._curve(gas, units, times, moments, fault), moments
 
     def solve_along(
         self, gas: Gas, times: Float[Array, "times"], tolerance: Any, gas_along: Gas, delay: Any
@@ -359,6 +372,7 @@ class KineticTheory(AbstractModel):
             delay: tangents of a shift of all times, shape (directions,).
         """
         times_along = jnp.broadcast_to(delay[:, None], (*delay.shape, times.size))
+        sound = self._is_sound(gas)
 
         def each(function, *primals):
             """Return values, and derivatives along each direction."""
@@ -368,26 +382,33 @@ class KineticTheory(AbstractModel):
 
             return jax.vmap(along, out_axes=(None, 0))
 
-        reduced = each(self._reduced, gas, times)(gas_along, times_along)
-        (scene, at), (scene_along, at_along) = reduced
+        def reduced(gas, times):
+            return self._reduced(gas, times, sound)
+
+        values, tangents = each(reduced, gas, times)(gas_along, times_along)
+        scene, at, units = values
+        scene_along, at_along, units_along = tangents
         solver = self._solver(gas, times, tolerance)
         state, state_along, fault = solver.moments_along(scene, at, scene_along, at_along)
+        fault |= status.flag(status.UNSUPPORTED, ~sound)
 
-        def curve(gas, times, state):
-            return dataclasses.replace(self._curve(gas, times, state, fault), status=None)
+        def curve(gas, units, times, state):
+            whole = self._curve(gas, units, times, state, fault)
+            return dataclasses.replace(whole, status=None)
 
-        computed, along = each(curve, gas, times, state)(gas_along, times_along, state_along)
-        whole = self._curve(gas, times, state, fault)
-        return dataclasses.replace(computed, status=whole.status), along
+        primals = gas, units, times, state
+        computed, along = each(curve, *primals)(gas_along, units_along, times_along, state_along)
+        return dataclasses.replace(computed, status=fault), along
 
     def _reduced(
-        self, gas: Gas, times: Float[Array, "times"]
-    ) -> tuple[SceneAndDensity, Float[Array, "times"]]:
-        """Return a gas and times in reduced units."""
-        # A search may try a T_0 at which spheres are too soft: no step is made then.
-        sound = self._is_sound(gas)
+        self, gas: Gas, times: Float[Array, "times"], sound: Bool[Array, ""]
+    ) -> tuple[SceneAndDensity, Float[Array, "times"], ReducedUnits]:
+        """Return a gas and times in reduced units, and the units of length and speed."""
+        units = ReducedUnits(gas.path_length, gas.impact_speed)
         scene = reduced_scene(gas), Density.from_gas(gas, self.softness, self.correlations)
-        return scene, jnp.where(sound, times, 0.0) * gas.impact_speed / gas.path_length
+        # A search may try a T_0 at which spheres are too soft: no step is made then.
+        reduced = jnp.where(sound, times, 0.0) * units.speed / units.length
+        return scene, reduced, units
 
     def _is_sound(self, gas: Gas) -> Bool[Array, ""]:
         sound = jnp.asarray(True)
@@ -413,11 +434,14 @@ class KineticTheory(AbstractModel):
         return MomentSolver(equations, self.solver, rtol * tolerance, self.max_steps)
 
     def _curve(
-        self, gas: Gas, times: Float[Array, "times"], state: Moments, fault: Int[Array, ""]
+        self,
+        gas: Gas,
+        units: ReducedUnits,
+        times: Float[Array, "times"],
+        state: Moments,
+        fault: Int[Array, ""],
     ) -> CoolingCurve:
         """Return the curve of moments in reduced units."""
-        length = gas.path_length
-        fault = fault | status.flag(status.UNSUPPORTED, ~self._is_sound(gas))
         theta = jnp.exp(state.log_temperature)
         # The last factor: compiled in float32, exp(nan) can be a number (jaxlib 0.10.1 on a CPU).
         # A factor makes derivatives nan, too.
@@ -431,9 +455,9 @@ class KineticTheory(AbstractModel):
         if state.size_ratio is not None:
             optional["size_ratio"] = jnp.exp(state.size_ratio) * one_or_nan
         if state.diffusion is not None and state.displacement is not None:
-            diffusion = state.diffusion * jnp.sqrt(theta) * length * gas.impact_speed
+            diffusion = state.diffusion * jnp.sqrt(theta) * units.length * units.speed
             optional["diffusion"] = diffusion * one_or_nan
-            optional["displacement"] = state.displacement * length**2 * one_or_nan
+            optional["displacement"] = state.displacement * units.length**2 * one_or_nan
         return CoolingCurve(
             times=times,
             temperature=temperature,

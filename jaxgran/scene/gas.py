@@ -401,8 +401,7 @@ class Gas(eqx.Module):
             ValueError: for a speed that is not positive.
         """
         POSITIVE.check("normal_speed", normal_speed, "Give the normal approach speed in m/s.")
-        law = self.law.reduced(diameter=self.diameter, mass=self.mass, speed=float_array(1.0))
-        return law.restitution(float_array(normal_speed))
+        return _restitution(self, float_array(normal_speed))
 
     def _viscoelastic(self, quantity: str) -> laws.Viscoelastic:
         if not isinstance(self.law, laws.Viscoelastic):
@@ -497,6 +496,13 @@ class Gas(eqx.Module):
         """
         num_particles = checked_int("num_particles", num_particles, 1)
         return (float_array(num_particles) / self.number_density) ** (1 / self.dimension)
+
+
+@eqx.filter_jit
+def _restitution(gas: Gas, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+    one = jnp.ones_like(gas.temperature)
+    law = gas.law.reduced(diameter=gas.diameter, mass=gas.mass, speed=one)
+    return law.restitution(normal_speed)
 
 
 SHEAR_VISCOSITY = {2: (2.0, 1.0, 0.8729), 3: (4.0, 0.8, 0.7614)}

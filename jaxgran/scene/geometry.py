@@ -7,6 +7,7 @@ from collections.abc import Callable
 from math import gamma, pi
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -48,8 +49,12 @@ def sphere_mass(diameter: UserNumber, density: UserNumber) -> Float[Array, "..."
     """
     POSITIVE.check("diameter", diameter, "Give the diameter in metres.")
     POSITIVE.check("density", density, "Give the density of the material in kg/m^3.")
-    diameter = float_array(diameter, unit="m")
-    return pi / 6 * float_array(density, unit="kg/m^3") * diameter**3
+    return _sphere_mass(float_array(diameter, unit="m"), float_array(density, unit="kg/m^3"))
+
+
+@jax.jit
+def _sphere_mass(diameter: Array, density: Array) -> Array:
+    return pi / 6 * density * diameter**3
 
 
 def contact_value(packing_fraction: ArrayLike, dimension: int) -> Any:
