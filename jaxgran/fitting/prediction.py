@@ -6,7 +6,7 @@ through the curve and through the scatter of N grains. They are differentiated b
 differences along the tangents of the curve: one call for all unknowns, by a second program.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple
@@ -32,7 +32,7 @@ from jaxgran.fitting.rows import (
     times_with_nodes,
 )
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.linearise import linearise
+from jaxgran.models.linearise import LinearisedCurve, linearise
 from jaxgran.scene.gas import Gas
 from jaxgran.theory.sizes import energy_ratio, energy_slope
 
@@ -317,6 +317,7 @@ def predicted_curve(
     values: dict[str, Any],
     elements: list[Element],
     tolerance: float = 1.0,
+    linearise: Callable[..., LinearisedCurve] = linearise,
 ) -> PredictedCurve:
     """Compute the curve of a measurement, with its derivatives.
 
@@ -326,6 +327,7 @@ def predicted_curve(
         values: SI values of parameters of the gas, of t0 and of nuisance parameters.
         elements: the unknowns of this measurement.
         tolerance: factor of the model's tolerance.
+        linearise: computes the curve.
     """
     names = values.keys() & rows.gas.domains.keys()
     floats = as_floats({name: values[name] for name in names})
@@ -434,6 +436,17 @@ def predicted_curve(
         elements,
         {name: x[place] if np.ndim(x) else x for name, x in known.items()},
     )
+
+
+def steady_curve(
+    model: AbstractModel, gas: Gas, times: np.ndarray, names: Collection[str], tolerance: float
+) -> LinearisedCurve:
+    """Return a curve of the shape of `linearise`, of a gas that does not cool."""
+    one = np.ones_like(times)
+    values = {"temperature": one, "sonine": one, "collisions": times / times[-1]}
+    if gas.diameter_sd is not None:
+        values["size_ratio"] = one
+    return LinearisedCurve(values, {}, {})
 
 
 def spread_of(gas: Gas) -> np.ndarray:

@@ -19,7 +19,13 @@ from jaxgran.fitting.parameters import (
     prior_residuals,
     residuals_and_slopes,
 )
-from jaxgran.fitting.prediction import Element, PredictedCurve, Residuals, predicted_curve
+from jaxgran.fitting.prediction import (
+    Element,
+    PredictedCurve,
+    Residuals,
+    predicted_curve,
+    steady_curve,
+)
 from jaxgran.fitting.rows import CurveRows, DropRows
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import Gas
@@ -235,6 +241,18 @@ class Problem:
             for name, (row, slopes) in prior_residuals(priors, gas, values[at]).items():
                 add(name, label or None, row, slopes)
         return summed(rows, curves)
+
+    def compile_innovations(self, flat: np.ndarray) -> None:
+        """Compile what an evaluation needs apart from the curves, whatever these are."""
+        values = self.values(flat)
+        elements = self.elements(flat)
+        for m in self.curves:
+            applied = [e for e in elements if e.label in (None, m.label)]
+            model = self._simplified_model
+            curve = predicted_curve(
+                m, model, values[m.label], applied, self.tolerance, steady_curve
+            )
+            curve.residuals(len(elements))
 
     def _curve(
         self, m: CurveRows, flat: np.ndarray, values: dict[str, Any], elements: list[Element]

@@ -1,5 +1,6 @@
 """What a user asks of a fit, as a problem with a first guess of its unknowns."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -86,7 +87,9 @@ def build_problem(request: Request) -> tuple[Problem, np.ndarray, list[str]]:
     for label, gas in guesses.items():  # and curves at what impacts alone tell
         guesses[label] = gas.replace(**{n: x for n, x in of_impacts.items() if n in gas.domains})
     first = problem.flat(_values_of_guesses(problem, guesses))
-    problem = problem_with_rate_errors(problem, first)
+    with ThreadPoolExecutor(1) as compiling:  # two programs are compiled at the same time
+        compiling.submit(problem.compile_innovations, first)
+        problem = problem_with_rate_errors(problem, first)
     if request.start is not None:
         complete = {
             label: with_values_of(guess, request.start, free) for label, guess in guesses.items()

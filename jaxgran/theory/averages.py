@@ -315,6 +315,7 @@ def rough_impact_means(
     eta: Float[Array, ""],
     inertia: Float[Array, ""],
     d: int,
+    gaussian: bool = False,
 ) -> list[Float[Array, "spheres n"]]:
     """Return mean changes of a sphere in an impact, times the rate of impacts over that at T = 1.
 
@@ -332,21 +333,29 @@ def rough_impact_means(
         eta: coefficient of `Rough`.
         inertia: q.
         d: dimension.
+        gaussian: leave out the changes of v^2 s^2 and s^4.
 
     Returns:
-        The changes of v^2 by the tangential and by the normal part, of s^2, v^2 s^2 and s^4, and
-        the impulse times the slip over V.
+        The changes of v^2 by the tangential and by the normal part, the impulse times the slip over
+        V, the changes of s^2, v^2 s^2 and s^4.
     """
     N, r = NUM_SPIN_COMPONENTS[d], 1 / inertia
-    per_S, per_V = 1 / S, 1 / V
     uJ, JJ, uuJJ, uuuJ, J4, uJ3, gguJ, ggJJ = slip_moments(m, d)
     z = eta * r
-    both, rest = T * a, a + r * T
-    along_n = T * T * per_S
     normal = kick * (kick * S - 2 * T)
-    pushed = along_n + normal
     of_v = eta * (eta * V * JJ - 2 * T * uJ)
     of_s = z * (z * V * JJ - 2 * a * uJ)
+    rate = jnp.sqrt(S / 2)
+    slipping = jnp.broadcast_to(eta * uJ, T.shape)
+    changes = [rate * x for x in (of_v, 2 * normal, slipping, of_s)]
+    if gaussian:
+        return changes
+    per_S = 1 / S
+    per_V = 1 / V
+    both = T * a
+    rest = a + r * T
+    along_n = T * T * per_S
+    pushed = along_n + normal
     of_vs = (
         2 * N * a * normal
         + eta * (2 * both * (((d + 1) * rest) * per_V - (N + r * d)) + 2 * r * a * along_n) * uJ
@@ -365,9 +374,7 @@ def rough_impact_means(
         + z**4 * V**2 * J4
         - 4 * z**3 * a * V * uJ3
     )
-    rate = jnp.sqrt(S / 2)
-    slipping = jnp.broadcast_to(eta * uJ, T.shape)
-    return [rate * x for x in (of_v, 2 * normal, of_s, of_vs, of_ss, slipping)]
+    return [*changes, rate * of_vs, rate * of_ss]
 
 
 def rough_energy_moments(

@@ -501,17 +501,18 @@ def rough_impact_rates(
     S = 1 + T1
     V = 1 + T1 + a + a1
     m = coulomb_limit(surface, eta, kick, V / S)
-    means = rough_impact_means(T, of_spin, S, V, m, kick, eta, q, d)
+    means = rough_impact_means(T, of_spin, S, V, m, kick, eta, q, d, gaussian)
     weights = jnp.zeros_like(T1).at[0, 0].set(0.5)
     if not gaussian:
         weights += sonine / (2 * size_T**2) * of_TT + correlation / (size_T * size_a) * of_Ta
         weights += kurtosis / (2 * size_a**2) * of_aa
         third = A12 * correlation * kurtosis * a / jnp.maximum(a**2, 1e-12)
         weights += third / (2 * size_T * size_a**2) * of_Taa
-    of_v, by_normal, of_s, of_vs, of_ss, slipping = (jnp.sum(x * weights) for x in means)
-    spinning, zero = of_s / num_spins, jnp.zeros_like(of_s)
-    turned = spreading = zero
+    of_v, by_normal, slipping, of_s, *of_cumulants = (jnp.sum(x * weights) for x in means)
+    spinning = of_s / num_spins
+    turned = spreading = jnp.zeros_like(of_s)
     if not gaussian:
+        of_vs, of_ss = of_cumulants
         cooling = -(of_v + by_normal) / d
         turned = of_vs / (d * num_spins) - spinning + (a + correlation) * cooling
         spreading = of_ss / (num_spins * (num_spins + 2)) - 2 * a * spinning
