@@ -13,7 +13,7 @@ from jaxgran._utils.tracing import fast_compilation, grid_size, pad_to
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import NODES
 from jaxgran.scene.laws import Viscoelastic
-from jaxgran.theory.averages import impact_moments
+from jaxgran.theory.averages import mean_inelasticity
 from jaxgran.theory.equations import softness_factor
 
 MAX_CHECKED_SPEED = 3.7
@@ -81,9 +81,8 @@ def _cooling(gas: Gas) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return ``-d ln T/dt`` by impacts, 1/s, of a Maxwellian gas at T_0, and eps at its lowest."""
     law = gas.reduced_law
     one = jnp.ones_like(gas.temperature)
-    mu_2 = impact_moments(law, one, gas.dimension, relaxation=False)[0, 0]
     speeds = jnp.asarray(NODES[NODES < MAX_CHECKED_SPEED], one.dtype)
-    rate = 2 / gas.dimension * mu_2 * gas.impact_speed / gas.path_length
+    rate = gas.collision_frequency * mean_inelasticity(law, one) / gas.dimension
     return rate, jnp.min(law.restitution(speeds))
 
 

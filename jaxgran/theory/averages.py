@@ -196,6 +196,21 @@ def impact_moments(
     return jnp.tensordot(jnp.asarray(matrix, speed.dtype), powers, 2)
 
 
+def mean_inelasticity(law: ReducedLaw, speed: Float[Array, ""]) -> Float[Array, ""]:
+    """Return <1 - eps^2> in a Maxwellian gas, weighted by the energy of the normal motion.
+
+    It is ``2 sqrt(2 pi)/S_d mu_2`` of `impact_moments`, by the same quadrature.
+
+    Args:
+        law: law of restitution in units of `Gas.impact_speed`.
+        speed: sqrt(T/T_0).
+    """
+    nodes = jnp.asarray(NODES, speed.dtype)
+    weights = jnp.asarray(WEIGHTS, speed.dtype) * nodes**2 / 2
+    _, loss, square = law.loss_powers(speed * nodes, 2)
+    return jnp.sum(weights * (2 * loss - square))
+
+
 def collision_rate(
     sonine: ArrayLike, dimension: int, third_sonine: ArrayLike = 0.0
 ) -> Float[Array, "..."]:
@@ -452,22 +467,17 @@ class RateTable(eqx.Module):
     def from_function(
         cls,
         averages: Callable[[Float[Array, ""]], Float[Array, "rows terms"]],
-        duration: Float[Array, ""],
-        dimension: int,
+        lowest: Float[Array, ""],
+        highest: Float[Array, ""],
         num_nodes: int,
-        bounds: ElementBounds = (0.0, 0.0, None, None),
     ) -> "RateTable":
-        """Return the series for all temperatures that a gas reaches in a given time.
+        """Return the series in a range of temperatures.
 
         Args:
             averages: the function to be tabulated, of sqrt(T/T_0).
-            duration: reduced time.
-            dimension: d.
+            lowest, highest: ends of ln(T/T_0), see `log_temperature_range`.
             num_nodes: number of terms; see `ReducedLaw.num_nodes`.
-            bounds: of the effects of the elements of the scene on T (`element_bounds`); by default
-                those of smooth spheres without walls, drag and drive.
         """
-        lowest, highest = _log_temperature_range(averages, duration, dimension, bounds)
         nodes, to_coefficients = (jnp.asarray(x, lowest.dtype) for x in _chebyshev(num_nodes))
         speeds = jnp.exp(highest / 2 + (lowest - highest) * (1 - nodes) / 4)
         values = jax.vmap(averages)(speeds)
@@ -524,14 +534,14 @@ def _derivative_matrix(num_nodes: int) -> np.ndarray:
     return np.pad(np.polynomial.chebyshev.chebder(np.eye(num_nodes)), ((0, 1), (0, 0)))
 
 
-def _log_temperature_range(
-    averages: Callable[[Float[Array, ""]], Float[Array, "rows terms"]],
+def log_temperature_range(
+    law: ReducedLaw,
     duration: Float[Array, ""],
     dimension: int,
-    bounds: ElementBounds,
+    bounds: ElementBounds = (0.0, 0.0, None, None),
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Bounds of ln(T/T_0) within a reduced time, the lower one negative and not far below the true
-    value, the upper one 0, or positive where the gas is heated.
+    value, the upper one 0, or positive where the gas is heated. They have no derivatives.
 
     The first lower bound is Haff's law for e = 0 with 10 % added to the rate. A law with small
     losses at low speed cools much less; a series over the whole range would lose digits. Therefore
@@ -542,14 +552,21 @@ def _log_temperature_range(
     spheres do not heat up beyond the temperature at which their impacts take the power of the
     drive, with half of the losses to spare for a_2 and soft contacts; the range is cut off one of
     `_SCAN_POINTS` temperatures above it.
+
+    Args:
+        law: law of restitution in units of `Gas.impact_speed`.
+        duration: reduced time.
+        dimension: d.
+        bounds: of the effects of the elements of the scene on T (`element_bounds`); by default
+            those of smooth spheres without walls, drag and drive.
     """
-    duration, bounds = jax.lax.stop_gradient((duration, bounds))
+    law, duration, bounds = jax.lax.stop_gradient((law, duration, bounds))
     by_speed, constant, heating, rotation = bounds
 
     def scan_to(bound: Array) -> tuple[Array, Array, Array]:
         scan = bound * jnp.linspace(0, 1, _SCAN_POINTS, dtype=bound.dtype)
         speeds = jnp.exp(scan / 2)
-        return scan, speeds, jax.lax.stop_gradient(jax.vmap(averages)(speeds)[:, 0, 0])
+        return scan, speeds, collisions / 2 * jax.vmap(partial(mean_inelasticity, law))(speeds)
 
     collisions = sphere_surface(dimension) / sqrt(2 * pi)
     haff = 1.1 * collisions / (2 * dimension) + by_speed / 2

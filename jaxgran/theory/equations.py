@@ -40,6 +40,7 @@ from jaxgran.theory.averages import (
     RateTable,
     collision_rate,
     impact_moments,
+    log_temperature_range,
     rough_impact_means,
 )
 from jaxgran.theory.sizes import (
@@ -219,8 +220,8 @@ class Equations(NamedTuple):
         averages = partial(
             impact_moments, law, dimension=d, order=self.order, relaxation=self.spreading
         )
-        bounds = element_bounds(scene[0], d)
-        return RateTable.from_function(averages, duration, d, law.num_nodes, bounds)
+        ends = log_temperature_range(law, duration, d, element_bounds(scene[0], d))
+        return RateTable.from_function(averages, *ends, law.num_nodes)
 
     def derivative(
         self,

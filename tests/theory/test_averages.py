@@ -38,7 +38,8 @@ def test_rate_table_is_exact_over_decades():
     for law in laws:
         for duration, tolerance in ((1e-3, 1e-11), (1.0, 1e-11), (1e5, 1e-11), (1e12, 1e-7)):
             direct = partial(kinetics.impact_moments, law, dimension=3)
-            table = RateTable.from_function(direct, jnp.asarray(duration), 3, law.num_nodes)
+            ends = kinetics.log_temperature_range(law, jnp.asarray(duration), 3)
+            table = RateTable.from_function(direct, *ends, law.num_nodes)
             x = jnp.linspace(table.lowest, 0.0, 300)
             error = jax.vmap(table)(x)[:, 0, 0] / jax.vmap(direct)(jnp.exp(x / 2))[:, 0, 0] - 1
             assert jnp.max(jnp.abs(error)) < tolerance
