@@ -294,6 +294,8 @@ def _empty(name: str, dtype: Any) -> Any:
 def _sized_for_all(model: AbstractSpheres, gases: Sequence[Gas], spare: float) -> AbstractSpheres:
     """Return a model with arrays long enough, and blocks of steps short enough, for all gases."""
     plans = [plan for gas in gases if (plan := model.sized_for(gas, spare).plan) is not None]
+    if len({plan.engine for plan in plans}) > 1:  # look-aheads of two searches, for one array
+        return _sized_for_all(dataclasses.replace(model, neighbours="cells"), gases, spare)
     steps = min(plan.steps for plan in plans)
     run, equilibration = (
         Capacity(*map(max, zip(*capacities, strict=True)))

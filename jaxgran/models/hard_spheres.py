@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import numpy as np
+import scipy  # which imports scipy.spatial at its first use
 from jaxtyping import Float
 
 from jaxgran._utils.tracing import any_traced, concrete_array
@@ -23,7 +24,6 @@ from jaxgran.particles.hard.dynamics import (
     HardDynamics,
     allowed_overlap,
 )
-from jaxgran.particles.neighbours import least_distance
 from jaxgran.scene.gas import Gas, SphereScene, reduced_scene, sphere_scene
 from jaxgran.theory.averages import collision_rate
 
@@ -67,8 +67,8 @@ class HardSpheres(AbstractSpheres):
         start: initial positions and velocities instead of random ones; their box must be that of
             the gas, and no spheres may overlap. In a container positions are coordinates from a
             corner, and centres must be at least a radius from each wall.
-        neighbours: the search for pairs: "sweep" (compiled with the rest), "scipy" (on the host),
-            "jax-md" (on the device, not inside `jax.jit`), or "auto" for the fastest here.
+        neighbours: the search for pairs: "sweep" (for boxes of up to some thousand spheres),
+            "cells" (for larger ones), "jax-md" (not inside `jax.jit`), or "auto" for the fastest.
         differences: step in the logarithm of an impact's loss, in (0, 0.5], of derivatives by
             differences of whole runs (`jaxgran.gradients.differences`), 0.3 for most uses. They
             need two more runs for each number of the law and have noise, but no bias in a gas that
@@ -142,7 +142,11 @@ class HardSpheres(AbstractSpheres):
             return  # the run checks traced values
         side = float(self.scene(gas).side)
         boxes = np.asarray(self.start.position, float) / float(gas.diameter)
-        closest = min(least_distance(box, side) for box in boxes)
+        trees = [scipy.spatial.KDTree(box % side, boxsize=side) for box in boxes]
+        # The nearest neighbour of each sphere after itself; infinite if none overlaps.
+        closest = min(
+            np.min(tree.query(tree.data, 2, distance_upper_bound=1.0)[0][:, 1]) for tree in trees
+        )
         if closest < 1 - float(allowed_overlap(self.start.position.dtype, side)):
             raise ValueError(
                 f"two spheres of the start are {closest:.9g} diameters apart, hard spheres must "
@@ -181,6 +185,7 @@ class HardSpheres(AbstractSpheres):
             crowded=plan.equilibration_capacity,
             listed_by_skin=self.listed_by_skin,
             engine=engine,
+            compiled_engine=plan.engine,
             share=plan.steps,
             contact_time=concrete_array(self.contact_time, scene.side.dtype),
             all_elastic=concrete_array(False),
@@ -208,6 +213,6 @@ class HardSpheres(AbstractSpheres):
         chosen = min((0.65 + 0.35 * near) * longest, around.listed)
         expected = around.listed, near, chosen, 1.25 * longest
         extra = 1.3 * max(around.in_contact - 0.4, 0.0)  # random positions have more near pairs
-        capacity, crowded = capacities(expected, around.lookahead, spare or 1.15, extra, n)
-        made_for = ("num_particles", self.num_particles), ("replicas", self.replicas)
-        return Plan(made_for, share, capacity, crowded)
+        capacity, crowded = capacities(expected, around, spare or 1.15, extra, n)
+        made_for = tuple((k, getattr(self, k)) for k in ("num_particles", "replicas", "neighbours"))
+        return Plan(made_for, share, capacity, crowded, around.engine)

@@ -88,8 +88,8 @@ class SoftSpheres(AbstractSpheres):
             describes what replicas share.
         start: initial positions and velocities instead of random ones; their box must be that of
             the gas.
-        neighbours: the search for pairs: "sweep" (compiled with the rest), "scipy" (on the host),
-            "jax-md" (on the device, not inside `jax.jit`), or "auto" for the fastest here.
+        neighbours: the search for pairs: "sweep" (for boxes of up to some thousand spheres),
+            "cells" (for larger ones), "jax-md" (not inside `jax.jit`), or "auto" for the fastest.
         projection: mean free times between thermal projections of a derivative, > 0; derivatives
             agree for 0.02 to 0.5 (see `jaxgran.gradients.tangents`). None for the plain
             derivative, which is exact, and useless after 3 to 5 collisions per particle.
@@ -246,6 +246,7 @@ class SoftSpheres(AbstractSpheres):
             crowded=plan.equilibration_capacity,
             listed_by_skin=self.listed_by_skin,
             engine=engine,
+            compiled_engine=plan.engine,
             steps_per_contact=self.steps_per_contact,
             steps_per_block=plan.steps,
             projection=concrete_array(self.projection or np.inf, scene.side.dtype),
@@ -275,7 +276,7 @@ class SoftSpheres(AbstractSpheres):
         expected = around.listed, near, touching, 2 * touching / (1 + 1.6 * touching**0.6)
         # At random positions the additional touching pairs are about those without correlation.
         extra = 1.3 * around.in_contact
-        capacity, crowded = capacities(expected, around.lookahead, spare or 1.2, extra, n)
-        names = "num_particles", "replicas", "steps_per_contact"
+        capacity, crowded = capacities(expected, around, spare or 1.2, extra, n)
+        names = "num_particles", "replicas", "neighbours", "steps_per_contact"
         made_for = tuple((name, getattr(self, name)) for name in names)
-        return Plan(made_for, steps, capacity, crowded)
+        return Plan(made_for, steps, capacity, crowded, around.engine)

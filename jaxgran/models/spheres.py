@@ -20,7 +20,7 @@ from jaxgran.models import checks
 from jaxgran.models.error_model import ErrorModel, slope_bias_of_run
 from jaxgran.models.particle_model import AbstractParticleModel
 from jaxgran.particles.capacity import Capacity, Neighbourhood
-from jaxgran.particles.neighbours import choose_engine
+from jaxgran.particles.neighbours import check_engine, choose_engine
 from jaxgran.particles.snapshot import Units
 from jaxgran.particles.spheres import AbstractSphereDynamics
 from jaxgran.particles.start import check_inside, check_start
@@ -41,12 +41,14 @@ class Plan(NamedTuple):
         steps: time steps in a block of soft spheres, impacts per particle in a window of hard ones.
         capacity: sizes of the arrays of the run.
         equilibration_capacity: sizes of the arrays in the first mean free times of equilibration.
+        engine: search for pairs in compiled code, for which `lookahead` of the sizes is made.
     """
 
-    made_for: tuple[tuple[str, int], ...]
+    made_for: tuple[tuple[str, Any], ...]
     steps: Any
     capacity: Capacity
     equilibration_capacity: Capacity
+    engine: str
 
 
 class AbstractSpheres(AbstractParticleModel):
@@ -98,11 +100,18 @@ class AbstractSpheres(AbstractParticleModel):
         """Return the expected numbers of neighbours in a scene of known numbers."""
         side = float(scene.filled_side)
         n = self.num_particles
-        around = Neighbourhood.expected(side, n, replicas, dimension, self.listed_by_skin)
-        if scene.container is None:
-            return around
-        shorter = max(1.0, side / float(scene.container[0]))  # the sweep runs along the first axis
-        return around._replace(lookahead=min(around.lookahead * shorter, n))
+        longer = 1.0
+        if scene.container is not None:  # the sweep runs along the first axis
+            longer = max(1.0, side / float(scene.container[0]))
+        return Neighbourhood.expected(
+            side,
+            n,
+            replicas,
+            dimension,
+            self.listed_by_skin,
+            engine=self.neighbours,
+            longer=longer,
+        )
 
     def derivative_error(self, error_model: ErrorModel) -> Float[np.ndarray, "times"]:
         """Relative error of projected derivatives by a flow, or of differences by their noise."""
@@ -166,7 +175,7 @@ class AbstractSpheres(AbstractParticleModel):
     ) -> AbstractSphereDynamics:
         """Return the motion of the spheres, with arrays of the planned sizes."""
         plan = self._known_plan(scene, dimension, replicas)
-        engine = choose_engine(self.neighbours, plan.capacity.lookahead, traced)
+        engine = choose_engine(self.neighbours, plan.engine, traced)
         if traced and engine == "jax-md":
             raise ValueError(
                 'inside jax.jit or jax.vmap neighbours="jax-md" is not supported, since it sizes '
@@ -211,7 +220,7 @@ class AbstractSpheres(AbstractParticleModel):
         """Check the whole numbers of the model against their minima, and its other settings."""
         for name, lowest in ({"num_particles": 2, "replicas": 1} | minimum).items():
             checked_int(name, getattr(self, name), lowest)
-        choose_engine(self.neighbours)
+        check_engine(self.neighbours)
         if self.differences is None:
             return
         advice = "Step in ln(loss), typically 0.3; None for projected derivatives."

@@ -7,6 +7,7 @@
 - `start`: initial conditions, random or given by the user.
 - `elements`: drag, the kicks of a drive, and rough impacts.
 - `neighbours`: periodic boxes and neighbour lists; the only module that imports jax_md.
+  `cell_list`: lists by cells. `bit_masks`: positions of the set bits of masks.
   `capacity`: lengths of the arrays of a compiled run.
 - `observables`: public functions of particles. `snapshot`: particles and saved records in SI.
 """

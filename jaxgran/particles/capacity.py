@@ -13,7 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Int
 
 from jaxgran._utils import status
-from jaxgran.particles.neighbours import unsorted_share
+from jaxgran.particles.bit_masks import WORD
+from jaxgran.particles.cell_list import expected_run
+from jaxgran.particles.neighbours import compiled_engine, unsorted_share
 from jaxgran.scene.geometry import contact_value, sphere_surface
 
 MAX_SHARED_ROWS = 128
@@ -52,7 +54,8 @@ class Capacity(NamedTuple):
 
     Attributes:
         pairs: pairs in the neighbour list.
-        lookahead: particles with which a sweep compares each particle.
+        lookahead: particles with which a search compares each particle: a sweep with the following
+            ones, cells with those in a run of cells.
         near: listed pairs that are near contact in a block (window).
         contacts: pairs that may be in contact in it.
         members: particles of those pairs.
@@ -84,27 +87,39 @@ class Neighbourhood(NamedTuple):
         contact_value: pair correlation at contact.
         collision_frequency: collision frequency at T = 1.
         listed: pairs per particle in the neighbour list.
-        lookahead: particles of a box within the list's cutoff along x.
+        engine: search for pairs in compiled code, "sweep" or "cells".
+        lookahead: particles of a box within the list's cutoff along x (sweep) or in a run (cells).
     """
 
     in_contact: float
     contact_value: float
     collision_frequency: float
     listed: float
+    engine: str
     lookahead: float
 
     @classmethod
     def expected(
-        cls, side: float, num_particles: int, replicas: int, dimension: int, listed_more: float
+        cls,
+        side: float,
+        num_particles: int,
+        replicas: int,
+        dimension: int,
+        listed_more: float,
+        *,
+        engine: str,
+        longer: float,
     ) -> "Neighbourhood":
         """Return the numbers for a box.
 
         Args:
-            side: side of the box in diameters.
+            side: side of a cube that the particles fill, in diameters.
             num_particles: number of particles in one box.
             replicas: number of boxes.
             dimension: dimension d.
             listed_more: pairs per particle that the skin adds to the neighbour list.
+            engine: one of `neighbours.ENGINES`.
+            longer: factor on the look-ahead of a sweep, of boxes that are shorter along x.
         """
         per_volume = sphere_surface(dimension) / (2 * dimension)
         exact = per_volume * num_particles / side**dimension
@@ -116,19 +131,34 @@ class Neighbourhood(NamedTuple):
         at_contact = contact_value(phi, dimension)
         frequency = 2 * dimension * in_contact * at_contact / pi**0.5
         listed = in_contact * (1 + skin) ** dimension
-        along_x = min((1 + skin) / side, 0.5)
-        lookahead = num_particles * (along_x + 3 * unsorted_share(num_particles))
-        return cls(in_contact, at_contact, frequency, listed, lookahead)
+        cutoff = (1 + skin) / side
+        lookahead = num_particles * (min(cutoff, 0.5) + 3 * unsorted_share(num_particles))
+        lookahead = min(lookahead * longer, float(num_particles))
+        engine = compiled_engine(engine, lookahead)
+        if engine == "cells":
+            lookahead = expected_run(num_particles, cutoff, dimension)
+        return cls(in_contact, at_contact, frequency, listed, engine, lookahead)
+
+    def lookahead_capacity(self, spare: float) -> int:
+        """Return the capacity of the look-ahead, by a factor on the expected one."""
+        most = spare * self.lookahead + 5 * self.lookahead**0.5
+        if self.engine == "cells":
+            return WORD * ceil(most / WORD)  # a word of comparisons is as fast as a part of it
+        return int(most) + 64  # planes of a lattice need most
 
 
 def capacities(
-    expected: Sequence[float], lookahead: float, spare: float, extra: float, num_particles: int
+    expected: Sequence[float],
+    around: Neighbourhood,
+    spare: float,
+    extra: float,
+    num_particles: int,
 ) -> tuple[Capacity, Capacity]:
     """Return the capacities of a run and of the first mean free times of its equilibration.
 
     Args:
         expected: rows per particle: listed pairs, near pairs, contacts, members.
-        lookahead: particles of a box within the cutoff along x.
+        around: expected numbers of neighbours.
         spare: capacity over expected rows; its root is used for the listed pairs, which vary least.
         extra: additional pairs per particle near contact at random initial positions.
         num_particles: number of particles of all replicas, the largest number of members.
@@ -139,7 +169,7 @@ def capacities(
     pairs, near, contacts, members = (
         int(s * x + 5 * x**0.5) + 64 for s, x in zip(spares, counts, strict=True)
     )
-    lookahead = int(spare * lookahead + 5 * lookahead**0.5) + 64  # planes of a lattice need most
+    lookahead = around.lookahead_capacity(spare)
     rows = int(num_particles * extra)
     more_near, more_contacts = (min(kind + rows, pairs) for kind in (near, contacts))
     run = Capacity(pairs, lookahead, near, contacts, min(members, num_particles))

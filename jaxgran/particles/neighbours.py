@@ -1,4 +1,4 @@
-"""Periodic boxes and neighbour lists, built by sweep and prune, by SciPy's k-d tree or by jax-md.
+"""Periodic boxes and neighbour lists, built by sweep and prune, by cells or by jax-md.
 
 Compiled code cannot make an array whose length depends on the number of pairs. Arrays have a fixed
 capacity instead, and the number of pairs is counted, so that the caller notices an overflow.
@@ -8,35 +8,14 @@ and compiles some hundred programs.
 """
 
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, UInt32
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-
-def rows_where(mask: Bool[Array, "all"], size: int) -> tuple[Int[Array, "{size}"], Int[Array, ""]]:
-    """Return the indices of the True entries of a mask, in increasing order, and their number.
-
-    The True entries are counted in words of 32 bits, and each is found in its word by bisection: on
-    a CPU this is two to six times as fast as a cumulative sum over the mask.
-
-    Args:
-        mask: the entries.
-        size: length of the array of indices.
-
-    Returns:
-        The indices, with ``mask.size`` in unused rows, and the number of True entries. If that
-        exceeds `size`, only the first `size` of them are returned.
-    """
-    num_words = -(-mask.size // 32)
-    bits = jnp.pad(mask, (0, 32 * num_words - mask.size)).reshape(num_words, 32)
-    places = jnp.arange(32, dtype=jnp.uint32)[None]
-    words = jnp.sum(bits.astype(jnp.uint32) << places, axis=1, dtype=jnp.uint32)
-    word, bit, count = bits_where(words, size)
-    return jnp.where(jnp.arange(size, dtype=jnp.int32) < count, 32 * word + bit, mask.size), count
+from jaxgran.particles.bit_masks import WORD, bits_where, rows_where
+from jaxgran.particles.cell_list import STEPS, cells, num_words_ahead, reach_in_steps
 
 
 def select_members(
@@ -71,40 +50,7 @@ def select_members(
     return rows, real, members, slots, [num_rows, num_members]
 
 
-def bits_where(
-    words: UInt32[Array, "words"], size: int
-) -> tuple[Int[Array, "{size}"], Int[Array, "{size}"], Int[Array, ""]]:
-    """Return the positions of the set bits of an array of words, in increasing order.
-
-    Args:
-        words: the bits; bit 0 is the lowest of a word.
-        size: length of the arrays of positions.
-
-    Returns:
-        For each set bit the index of its word and its place in that word, 0 to 31, and the number
-        of set bits. Rows beyond that number hold arbitrary values.
-    """
-    counts = jax.lax.population_count(words).astype(jnp.int32)
-    ends = jnp.cumsum(counts, dtype=jnp.int32)
-    starts = ends - counts
-    row = jnp.arange(size, dtype=jnp.int32)
-    num_starts = jnp.zeros(size, jnp.int32).at[starts].add(1, mode="drop")
-    word = jnp.cumsum(num_starts, dtype=jnp.int32) - 1  # the last one that starts up to this row
-    rest = words[word]
-    rank = row - starts[word]
-    bit = jnp.zeros(size, jnp.int32)
-    for half in (16, 8, 4, 2, 1):
-        low = jax.lax.population_count(rest & jnp.uint32(2**half - 1)).astype(jnp.int32)
-        upper = rank >= low
-        rest = jnp.where(upper, rest >> half, rest)
-        rank = jnp.where(upper, rank - low, rank)
-        bit = jnp.where(upper, bit + half, bit)
-    return word, bit, ends[-1]
-
-
-_WORD = 32
-_X_STEPS = 2.0**30
-_YZ_STEPS = 2.0**32  # grid steps per box side, along x and the other axes
+_X_STEPS = 2.0**30  # grid steps per box side along x, in a sweep
 
 
 def unsorted_share(num_particles: int) -> float:
@@ -153,13 +99,7 @@ def sweep(
         ValueError: if the number of particles times the look-ahead is too large for 32-bit indices.
     """
     n = len(position) // replicas
-    num_words = max(-(-min(ahead, n) // _WORD), 1)
-    if num_words * replicas * n >= 2**31:
-        raise ValueError(
-            f"a sweep over {replicas * n} particles cannot look {ahead} particles ahead: its "
-            f"indices have 32 bits, which allow {(2**31 - 1) // (replicas * n) * _WORD} ahead. Use "
-            "neighbours='scipy' or 'jax-md'"
-        )
+    num_words = num_words_ahead("sweep", min(ahead, n), replicas * n, 1)
     unit = position.reshape(replicas, n, position.shape[-1]) / side
     unit = jnp.where(unit >= 1, 0.0, unit)  # by rounding
 
@@ -173,31 +113,31 @@ def sweep(
     # Coordinates as whole numbers of steps, continued periodically: the next image of the box
     # follows the last particle, and then padding at a large distance.
     here = [(unit[..., 0] * _X_STEPS).astype(jnp.int32)]
-    here += [((unit[..., k] - 0.5) * _YZ_STEPS).astype(jnp.int32) for k in range(1, unit.shape[-1])]
+    here += [((unit[..., k] - 0.5) * STEPS).astype(jnp.int32) for k in range(1, unit.shape[-1])]
     images = [here[0] + int(_X_STEPS), *here[1:]]
-    end = jnp.full((replicas, 2 * _WORD), jnp.iinfo(jnp.int32).max)
+    end = jnp.full((replicas, 2 * WORD), jnp.iinfo(jnp.int32).max)
     ahead_of = [jnp.concatenate([x, y, end], axis=1) for x, y in zip(here, images, strict=True)]
 
     def following(axis: int, block: Array, count: int) -> Int[Array, "replicas {count}"]:
-        first = _WORD * block + 1
+        first = WORD * block + 1
         return jax.lax.dynamic_slice_in_dim(ahead_of[axis], first, count, axis=1)
 
     # The cutoff in steps of y and z, and along x in steps of x, enlarged by the rounding errors.
-    reach = cutoff / side * _YZ_STEPS + 8 + 4 * _YZ_STEPS * jnp.finfo(position.dtype).eps
-    square = jnp.minimum(reach * reach * (1 + 1e-6), (_YZ_STEPS / 2) ** 2).astype(jnp.float32)
-    along_x = (reach * (_X_STEPS / _YZ_STEPS)).astype(jnp.int32) + 2 ** max(bits - 1, 1)
+    reach, square = reach_in_steps(cutoff, side, position)
+    square = jnp.minimum(square, (STEPS / 2) ** 2)  # beyond, pairs would occur twice
+    along_x = (reach * (_X_STEPS / STEPS)).astype(jnp.int32) + 2 ** max(bits - 1, 1)
     finite = jnp.all(jnp.isfinite(position))
 
     def compare_block(carry):
         block, words = carry
-        window = [following(axis, block, n + _WORD - 1) for axis in range(len(here))]
+        window = [following(axis, block, n + WORD - 1) for axis in range(len(here))]
         word = jnp.zeros((replicas, n), jnp.uint32)
-        for bit in range(_WORD):
+        for bit in range(WORD):
             apart = [
                 (there[:, bit : bit + n] - x).astype(jnp.float32)
                 for there, x in zip(window, here, strict=True)
             ]
-            apart[0] *= _YZ_STEPS / _X_STEPS
+            apart[0] *= STEPS / _X_STEPS
             near = sum(a * a for a in apart) < square
             word |= near.astype(jnp.uint32) << bit
         return block + 1, words.at[block].set(word, mode="drop")
@@ -205,7 +145,7 @@ def sweep(
     def unfinished(carry):
         block, _ = carry
         nearest = jnp.min(following(0, block, n) - here[0])
-        return finite & (_WORD * block + 1 < n) & (nearest <= along_x)
+        return finite & (WORD * block + 1 < n) & (nearest <= along_x)
 
     words = jnp.zeros((num_words, replicas, n), jnp.uint32)
     blocks, words = jax.lax.while_loop(unfinished, compare_block, (jnp.int32(0), words))
@@ -214,20 +154,21 @@ def sweep(
     word, bit, count = bits_where(words.ravel(), capacity)
     index = word % (replicas * n)
     first = n * (index // n)
-    there = index - first + _WORD * (word // (replicas * n)) + bit + 1
+    there = index - first + WORD * (word // (replicas * n)) + bit + 1
     there = first + jnp.where(there >= n, there - n, there)
     particle = (order + n * jnp.arange(replicas, dtype=jnp.int32)[:, None]).ravel()
     in_use = jnp.arange(capacity, dtype=jnp.int32) < count
     i, j = (jnp.where(in_use, particle.at[k].get(mode="clip"), 0) for k in (index, there))
-    return jnp.minimum(i, j), jnp.maximum(i, j), count, jnp.minimum(_WORD * blocks, n - 1)
+    return jnp.minimum(i, j), jnp.maximum(i, j), count, jnp.minimum(WORD * blocks, n - 1)
 
 
-ENGINES = ("auto", "sweep", "scipy", "jax-md")
-"""Methods of building neighbour lists: `sweep` in compiled code, SciPy's k-d tree on the host, or
-jax-md on the device; "auto" is the fastest of them."""
+ENGINES = ("auto", "sweep", "cells", "jax-md")
+"""Methods of building neighbour lists: `sweep` and `cells` in compiled code, or jax-md on the
+device; "auto" is the fastest of them."""
 
-MAX_LOOKAHEAD = 1500
-"""Largest look-ahead, in particles, up to which a sweep is faster than a tree."""
+MAX_LOOKAHEAD = 450
+"""Expected look-ahead, in particles, up to which a sweep is as fast as cells. It is that of some
+5000 spheres."""
 
 
 class Pairs(NamedTuple):
@@ -239,8 +180,8 @@ class Pairs(NamedTuple):
             shortest displacement of the pair. It remains valid while particles move without being
             wrapped.
         count: number of pairs. If it exceeds the capacity of the list, pairs are missing.
-        lookahead: look-ahead, in particles, that a sweep needed. If it exceeds the capacity of the
-            sweep, pairs are missing. 0 for the other engines.
+        lookahead: look-ahead, in particles, that a sweep or cells needed. If it exceeds their
+            capacity, pairs are missing. 0 for jax-md.
     """
 
     i: Int[Array, "pairs"]
@@ -256,34 +197,47 @@ def wrap(side: ArrayLike, position: Float[Array, "n d"]) -> Float[Array, "n d"]:
     return jnp.where(inside >= side, 0.0, inside)  # rounding may give exactly `side`
 
 
-def choose_engine(name: str, ahead: int = 0, traced: bool = False) -> str:
-    """Return the engine that builds neighbour lists: `name`, or for "auto" the fastest one.
-
-    As measured, the fastest engine is jax-md on a GPU, outside of compiled code. On a CPU it is a
-    sweep up to a look-ahead of `MAX_LOOKAHEAD`, and a tree beyond. In compiled code it is a sweep,
-    which does not call the host.
-
-    Args:
-        name: one of `ENGINES`.
-        ahead: capacity of a sweep's look-ahead, in particles.
-        traced: whether the list is built in code that is being compiled or differentiated.
-
-    Raises:
-        ValueError: for any other name.
-    """
+def check_engine(name: str) -> None:
+    """Raise ValueError for a name that is not one of `ENGINES`."""
     if name not in ENGINES:
         raise ValueError(
             f'neighbours must be one of {", ".join(ENGINES)}, got {name!r}. The default is "auto"'
         )
-    if name != "auto":
+
+
+def compiled_engine(name: str, ahead: float) -> str:
+    """Return the engine that builds neighbour lists in compiled code, "sweep" or "cells".
+
+    It is `name`, or for "auto" and "jax-md" the fastest one, as measured on a CPU: a sweep up to a
+    look-ahead of `MAX_LOOKAHEAD`, and cells beyond.
+
+    Args:
+        name: one of `ENGINES`.
+        ahead: expected look-ahead of a sweep, in particles.
+    """
+    if name in ("sweep", "cells"):
         return name
-    if jax.default_backend() != "cpu" and not traced:
+    return "sweep" if ahead <= MAX_LOOKAHEAD else "cells"
+
+
+def choose_engine(name: str, compiled: str, traced: bool) -> str:
+    """Return the engine that builds neighbour lists in a run, one of `ENGINES` but not "auto".
+
+    "auto" is jax-md on an accelerator, outside of compiled code.
+
+    Args:
+        name: one of `ENGINES`.
+        compiled: the engine in compiled code.
+        traced: whether the list is built in code that is being compiled or differentiated.
+    """
+    on_accelerator = jax.default_backend() != "cpu"
+    if name == "jax-md" or (name == "auto" and on_accelerator and not traced):
         return "jax-md"
-    return "sweep" if traced or ahead <= MAX_LOOKAHEAD else "scipy"
+    return compiled
 
 
-ListedPairs = tuple[Int[Any, "pairs"], Int[Any, "pairs"], Int[Any, ""], Int[Any, ""]]
-"""Fields i, j, count and lookahead of `Pairs`: NumPy arrays if a tree on the host found them."""
+ListedPairs = tuple[Int[Array, "pairs"], Int[Array, "pairs"], Int[Array, ""], Int[Array, ""]]
+"""Fields i, j, count and lookahead of `Pairs`."""
 
 
 def search_pairs(
@@ -296,10 +250,9 @@ def search_pairs(
 ) -> ListedPairs:
     """Find all pairs closer than a cutoff in each of several equal periodic boxes.
 
-    The result has no derivatives. `with_offsets` adds the offsets in compiled code. A sweep is
-    compiled. A tree works under `jax.jit` and `jax.vmap` too, by a callback to the host. jax-md
-    chooses the number of its cells from the values: `position`, `side` and `cutoff` must not be
-    traced.
+    The result has no derivatives. `with_offsets` adds the offsets in compiled code. A sweep and
+    cells are compiled, also under `jax.jit` and `jax.vmap`. jax-md chooses the number of its cells
+    from the values: `position`, `side` and `cutoff` must not be traced.
 
     Args:
         position: positions of all particles, replica after replica, in [0, side).
@@ -307,17 +260,17 @@ def search_pairs(
         cutoff: distance in the same unit, > 0 and at most half a side; for a sweep less than that
             by at least a part in 10^6.
         replicas: number of boxes; particles of different boxes form no pairs.
-        capacity: capacity of the list, in pairs, and of a sweep's look-ahead, in particles.
-        engine: "scipy", "sweep" or "jax-md". All return the same pairs, but may differ in pairs
+        capacity: capacity of the list, in pairs, and of the look-ahead, in particles.
+        engine: "sweep", "cells" or "jax-md". All return the same pairs, but may differ in pairs
             within rounding error of the cutoff.
     """
     position, side, cutoff = jax.lax.stop_gradient((position, side, cutoff))
     max_pairs, ahead = capacity
-    if engine == "sweep":
-        return sweep(position, side, cutoff, replicas=replicas, capacity=max_pairs, ahead=ahead)
-    build = {"scipy": _tree_pairs, "jax-md": _jax_md_pairs}[engine]
-    i, j, count = build(position, side, cutoff, replicas, max_pairs)
-    return i, j, count, np.int32(0)
+    if engine == "jax-md":
+        i, j, count = _jax_md_pairs(position, side, cutoff, replicas, max_pairs)
+        return i, j, count, jnp.zeros((), jnp.int32)
+    search = {"sweep": sweep, "cells": cells}[engine]
+    return search(position, side, cutoff, replicas=replicas, capacity=max_pairs, ahead=ahead)
 
 
 @jax.jit
@@ -329,62 +282,6 @@ def with_offsets(
     i, j, count, lookahead = listed
     offset = side * jnp.round((position[i] - position[j]) / side)
     return Pairs(i, j, offset, count, lookahead)
-
-
-def _tree_pairs(position, side, cutoff, replicas: int, capacity: int):
-    def host(position, side, cutoff):
-        return tree_search(np.asarray(position), float(side), float(cutoff), replicas, capacity)
-
-    if not any(isinstance(x, Tracer) for x in (position, side, cutoff)):
-        return host(position, side, cutoff)
-    index = jax.ShapeDtypeStruct((capacity,), jnp.int32)
-    shapes = index, index, jax.ShapeDtypeStruct((), jnp.int32)
-    return jax.pure_callback(host, shapes, position, side, cutoff, vmap_method="sequential")
-
-
-def close_pairs(points: Float[np.ndarray, "n d"], side: float, cutoff: float) -> np.ndarray:
-    """Return the indices of all pairs of points closer than a cutoff in a periodic box."""
-    from scipy.spatial import KDTree  # the import takes a tenth of a second
-
-    # Unbalanced trees give the same pairs and are built in half of the time.
-    tree = KDTree(points, boxsize=side, balanced_tree=False, compact_nodes=False)
-    return tree.query_pairs(cutoff, output_type="ndarray")
-
-
-def least_distance(points: Float[np.ndarray, "n d"], side: float) -> float:
-    """Return the least distance between two points in a periodic box, and 1 if none is less."""
-    i, j = close_pairs(np.mod(points, side) % side, side, 1.0).T
-    separation = points[i] - points[j]
-    separation = separation - side * np.round(separation / side)
-    return float(np.sqrt(np.min(np.sum(separation**2, axis=1), initial=1.0)))
-
-
-def tree_search(
-    position: Float[np.ndarray, "particles d"],
-    side: float,
-    cutoff: float,
-    replicas: int,
-    capacity: int,
-) -> tuple[
-    Int[np.ndarray, "{capacity}"], Int[np.ndarray, "{capacity}"], Int[np.ndarray | np.int32, ""]
-]:
-    """Find pairs on the host; return i, j and count of `Pairs` as NumPy arrays.
-
-    If any position is not finite, no pairs are returned.
-    """
-    pairs = np.zeros((2, capacity), np.int32)
-    count = 0
-    if np.all(np.isfinite(position)):
-        boxes = position.reshape(replicas, -1, position.shape[-1]).astype(np.float64)
-        boxes = np.where(boxes >= side, 0.0, boxes)  # by rounding
-        for first, points in zip(range(0, len(position), boxes.shape[1]), boxes, strict=True):
-            in_box = close_pairs(points, side, cutoff)
-            end = min(count + len(in_box), capacity)
-            pairs[:, count:end] = in_box[: end - count].T + first
-            count += len(in_box)
-            if count > capacity:
-                break
-    return pairs[0], pairs[1], np.int32(count)
 
 
 def _jax_md_pairs(position, side, cutoff, replicas: int, capacity: int):
@@ -402,7 +299,7 @@ def _jax_md_pairs(position, side, cutoff, replicas: int, capacity: int):
                 raise RuntimeError(
                     f"jax-md's neighbour list overflows even at {multiplier:.3g} times the "
                     f"capacity of a homogeneous gas, and the limit is {max_multiplier:g}. Use "
-                    "neighbours='scipy'"
+                    "neighbours='cells'"
                 )
             multiplier *= 1.5
     return _flatten(lists.idx, boxes.shape[1], capacity)

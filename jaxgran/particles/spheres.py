@@ -134,6 +134,7 @@ class AbstractSphereDynamics(AbstractDynamics):
         crowded: lengths of the arrays in the first mean free times of the equilibration.
         listed_by_skin: pairs per particle that the skin adds to the first neighbour list.
         engine: search for pairs, one of `neighbours.ENGINES` but not "auto".
+        compiled_engine: the same in compiled code, as in the random placement.
     """
 
     scene: AbstractVar[SphereScene]
@@ -141,6 +142,7 @@ class AbstractSphereDynamics(AbstractDynamics):
     crowded: AbstractVar[Capacity]
     listed_by_skin: AbstractVar[float]
     engine: AbstractVar[str]
+    compiled_engine: AbstractVar[str]
 
     @abstractmethod
     def elastic(self: S) -> S:
@@ -217,7 +219,7 @@ class AbstractSphereDynamics(AbstractDynamics):
             skin=self.first_skin,
             shape=self.shape,
             capacity=self.crowded,
-            engine="sweep" if self.calls_host else self.engine,
+            engine=self.compiled_engine,
         )
 
     def initial(self, start: Any, key: Any, directions: Any) -> SphereState:

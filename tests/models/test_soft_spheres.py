@@ -77,7 +77,7 @@ def test_a_step_too_large_is_shortened():
 def test_whoever_finds_the_pairs_the_run_is_the_same():
     gas = soft_beads(0.05, 0.2, packing_fraction=0.1)
     model = SoftSpheres(64, replicas=2, start=lattice(gas, 64, replicas=2))
-    engines = "scipy", "sweep", "jax-md"
+    engines = "cells", "sweep", "jax-md"
     models = (dataclasses.replace(model, neighbours=by) for by in engines)
     a, *others = curves_of(gas, [0.5], *models)
     for b in others:

@@ -9,7 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran import HardSpheres, SoftSpheres
-from tests.beads import curves_of, glass_beads, hard_gas, soft_beads
+from tests.beads import curves_of, glass_beads, hard_gas, soft_beads, spheres
 
 
 def between_walls(law, beta=0.15, wall_beta=None) -> jaxgran.Gas:
@@ -99,15 +99,44 @@ def test_a_plan_is_of_its_model():
         (soft, "steps_per_contact", 80),
         (soft, "replicas", 2),
         (hard, "replicas", 3),
+        (hard, "neighbours", "cells"),
     ):
         changed = dataclasses.replace(sized, **{name: value})
         with pytest.raises(
             ValueError, match=f"sized for {name} = .*{value}.* sized_for.gas. again"
         ):
             jaxgran.cool(gas, [1.0], model=changed)
-    elsewhere = dataclasses.replace(soft, neighbours="jax-md")
+    elsewhere = SoftSpheres(100, neighbours="jax-md").sized_for(gas)
     with pytest.raises(ValueError, match="leave neighbours out"):
         jax.jit(lambda t: jaxgran.cool(gas, t, model=elsewhere).temperature)(jnp.array([1e-3]))
+
+
+def test_large_boxes_are_searched_by_cells():
+    gas = hard_gas()
+    engines = [HardSpheres(n).sized_for(gas).plan.engine for n in (1000, 4096, 50_000)]
+    assert engines == ["sweep", "sweep", "cells"]
+
+
+@pytest.mark.slow
+def test_a_cluster_with_more_spheres_than_a_run_of_cells_holds():
+    # All spheres in a corner of the box, 6 times as dense as the gas.
+    n, gas = 343, hard_gas(0.9, 0.05)
+    rng = np.random.default_rng(2)
+    sites = np.stack(np.meshgrid(*[np.arange(7.0)] * 3), -1).reshape(-1, 3)
+    position = 1.2 * sites + 0.09 * rng.uniform(-1, 1, (n, 3))
+    start = spheres(position % float(gas.box_side(n)), rng.normal(size=(n, 3)), gas.box_side(n))
+    times = jnp.array([0.05, 0.2]) * gas.mean_free_time
+
+    def run(by, spare):
+        model = HardSpheres(n, start=start, neighbours=by).sized_for(gas, spare)
+        return jax.jit(lambda t: jaxgran.cool(gas, t, model=model))(times)
+
+    sweep, cells = run("sweep", 60.0), run("cells", 60.0)
+    assert sweep.status == cells.status == 0 and sweep.collisions[-1] > 1
+    np.testing.assert_array_equal(sweep.collisions, cells.collisions)
+    np.testing.assert_allclose(sweep.particles.velocity, cells.particles.velocity, atol=1e-9)
+    # Inside of jit arrays cannot grow: a status, and no pair that is lost silently.
+    assert "neighbour list is full" in jaxgran.explain_status(run("cells", 1.0).status)
 
 
 @pytest.mark.slow

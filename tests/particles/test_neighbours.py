@@ -8,10 +8,19 @@ import pytest
 from scipy.spatial import KDTree
 
 from jaxgran.particles import neighbours
-from jaxgran.particles.neighbours import MAX_LOOKAHEAD, choose_engine, sweep, wrap
+from jaxgran.particles.cell_list import expected_run
+from jaxgran.particles.neighbours import (
+    MAX_LOOKAHEAD,
+    cells,
+    check_engine,
+    choose_engine,
+    compiled_engine,
+    sweep,
+    wrap,
+)
 
 
-def find_pairs(position, side, cutoff, *, replicas=1, capacity, by="scipy"):
+def find_pairs(position, side, cutoff, *, replicas=1, capacity, by="cells"):
     """All pairs with their offsets; a sweep may look ahead over all particles of a replica."""
     capacities = capacity, len(position) // replicas
     pairs = neighbours.search_pairs(position, side, cutoff, replicas, capacities, by)
@@ -49,7 +58,7 @@ def awkward(dimension, replicas, side, n=30):
 @pytest.mark.parametrize(
     "dimension, by, fraction",
     [
-        *((d, "scipy", fraction) for d in (2, 3) for fraction in (0.15, 0.4999, 0.5)),
+        *((d, "cells", fraction) for d in (2, 3) for fraction in (0.15, 0.3, 0.4999, 0.5)),
         *((d, "sweep", 0.5) for d in (2, 3)),
         *(pytest.param(d, "jax-md", 0.15, marks=pytest.mark.slow) for d in (2, 3)),
     ],
@@ -77,7 +86,7 @@ def test_pairs_are_those_of_brute_force(dimension, by, fraction):
     )
 
 
-@pytest.mark.parametrize("dimension, by", [(2, "scipy"), (3, "scipy"), (3, "sweep")])
+@pytest.mark.parametrize("dimension, by", [(2, "cells"), (3, "cells"), (3, "sweep")])
 def test_jit_and_vmap(dimension, by):
     rng = np.random.default_rng(3)
     batch = jnp.asarray(rng.random((3, 40, dimension)))
@@ -104,7 +113,7 @@ def test_pairs_carry_no_derivatives():
         np.testing.assert_allclose(gradient, [[0.4, -1.0], [-0.4, 1.0], [0.0, 0.0]], atol=1e-14)
 
 
-@pytest.mark.parametrize("by", ["scipy", "sweep"])
+@pytest.mark.parametrize("by", ["cells", "sweep"])
 def test_numbers_that_are_not_finite_have_no_pairs(by):
     for bad in (jnp.nan, jnp.inf):
         position = jnp.ones((4, 3)).at[2, 1].set(bad)
@@ -125,16 +134,74 @@ def test_wrap_lands_inside(side):
 
 
 def test_engine_follows_the_device_and_the_gas(monkeypatch):
-    with pytest.raises(ValueError, match="must be one of auto, sweep, scipy, jax-md, got 'kd'"):
-        choose_engine("kd")
-    assert choose_engine("scipy", 1) == "scipy" and choose_engine("sweep", 10**6) == "sweep"
-    assert choose_engine("jax-md") == "jax-md"
-    for device, dense in (("cpu", "scipy"), ("gpu", "jax-md")):
+    with pytest.raises(ValueError, match="must be one of auto, sweep, cells, jax-md, got 'scipy'"):
+        check_engine("scipy")
+    assert compiled_engine("cells", 1.0) == "cells" and compiled_engine("sweep", 1e6) == "sweep"
+    for name in ("auto", "jax-md"):
+        assert compiled_engine(name, float(MAX_LOOKAHEAD)) == "sweep"
+        assert compiled_engine(name, MAX_LOOKAHEAD + 1.0) == "cells"
+    for device, auto in (("cpu", "cells"), ("gpu", "jax-md")):
         monkeypatch.setattr(jax, "default_backend", lambda device=device: device)
-        assert choose_engine("auto", MAX_LOOKAHEAD + 1) == dense
-        assert choose_engine("auto", MAX_LOOKAHEAD) == ("sweep" if device == "cpu" else "jax-md")
-        # Compiled code calls nothing on the host.
-        assert choose_engine("auto", 10 * MAX_LOOKAHEAD, traced=True) == "sweep"
+        assert choose_engine("auto", "cells", traced=False) == auto
+        assert choose_engine("auto", "cells", traced=True) == "cells"
+        assert choose_engine("sweep", "sweep", traced=False) == "sweep"
+        assert choose_engine("jax-md", "sweep", traced=False) == "jax-md"
+
+
+def tree_pairs(boxes, side, cutoff):
+    """The pairs of a k-d tree in each of several periodic boxes."""
+    boxes = np.asarray(boxes, float)
+    n = boxes.shape[1]
+    trees = [KDTree(box, boxsize=side).query_pairs(cutoff) for box in boxes]
+    return {(i + n * k, j + n * k) for k, tree in enumerate(trees) for i, j in tree}
+
+
+def gases(side, dimension, n=300):
+    """Two boxes of points that are distributed in several ways, by name."""
+    rng = np.random.default_rng(dimension)
+    gas = side * rng.random((2, n, dimension))
+    clusters = gas[:, ::30].repeat(30, axis=1) + rng.normal(size=gas.shape)
+    flat, long = gas.copy(), gas.copy()
+    flat[..., 0] = 0.1 * gas[..., 0] + 0.97 * side  # across the boundary of the box
+    long[..., :-1] = 0.05 * gas[..., :-1]
+    sites = int(np.ceil(n ** (1 / dimension)))
+    lattice = np.stack(np.meshgrid(*[np.arange(sites)] * dimension), -1).reshape(-1, dimension)
+    lattice = np.stack([side / sites * lattice[:n]] * 2)
+    different = np.stack([gas[0], clusters[0]])
+    named = {"gas": gas, "clusters": clusters, "flat": flat, "long": long, "one point": 0 * gas}
+    named |= {"lattice": lattice, "different": different}
+    return {name: np.mod(boxes, side) % side for name, boxes in named.items()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_cells_lose_no_pair_and_say_how_many_they_need(dimension):
+    # Cells limited by the number of particles, some around the box, just three, and one.
+    for side, cutoff in ((30.0, 1.01), (14.0, 3.1), (10.0, 3.1), (10.0, 3.6), (10.0, 5.0)):
+        for name, boxes in gases(side, dimension).items():
+            least, largest = (tree_pairs(boxes, side, r) for r in (cutoff, cutoff + 1e-6 * side))
+            n = boxes.shape[1]
+            flat = jnp.asarray(boxes.reshape(-1, dimension))
+            search = partial(cells, flat, side, cutoff, replicas=2, capacity=n * n)
+            i, j, count, longest = search(ahead=n)
+            found = listed(i, j, count)
+            assert len(set(found)) == len(found), (name, side)  # each once
+            assert least <= set(found) <= largest, (name, side)
+            assert 0 <= longest < n and not np.any(i[count:]) and not np.any(j[count:])
+            *_, short_count, told = search(ahead=32)
+            assert told == longest and (short_count == count or longest > 32), (name, side)
+            assert short_count < count or name != "one point"
+            if name == "gas":
+                mean = expected_run(n, cutoff / side, dimension)
+                assert longest < mean + 6 * mean**0.5  # fluctuations of 600 particles
+
+
+def test_cells_count_pairs_beyond_their_capacity():
+    position = jnp.asarray(10 * np.random.default_rng(1).random((300, 3)))
+    *_, count, _ = cells(position, 10.0, 2.0, replicas=1, capacity=4000, ahead=300)
+    i, j, told, _ = cells(position, 10.0, 2.0, replicas=1, capacity=100, ahead=300)
+    assert told == count > 100
+    assert np.all(np.asarray(i) < np.asarray(j))  # all of them pairs
 
 
 @pytest.mark.slow
@@ -145,8 +212,7 @@ def test_a_sweep_looks_as_far_as_it_must():
     gas = side * rng.random((2, n, 3))
     for squeezed, crowd in ((1.0, 1), (0.1, 10), (0.0, n)):
         position = gas * np.array([squeezed, 1.0, 1.0])
-        trees = [KDTree(box, boxsize=side).query_pairs(1.0) for box in position]
-        expected = {(i + n * k, j + n * k) for k, tree in enumerate(trees) for i, j in tree}
+        expected = tree_pairs(position, side, 1.0)
         flat = jnp.asarray(position.reshape(-1, 3))
         look = partial(sweep, flat, side, 1.0, replicas=2, capacity=len(expected) + 9)
         i, j, count, ahead = look(ahead=n)
@@ -160,8 +226,9 @@ def test_a_sweep_looks_as_far_as_it_must():
         assert told == ahead and enough == count
 
 
+@pytest.mark.parametrize("search", [sweep, cells])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_a_sweep_misses_no_pair_just_within_the_cutoff(dtype):
+def test_no_pair_just_within_the_cutoff_is_missed(dtype, search):
     # Far apart, so that a whole number of steps of the side is many of the cutoff's round-off.
     rng = np.random.default_rng(8)
     side, n, cutoff = 1000.0, 20_000, 0.5
@@ -174,7 +241,7 @@ def test_a_sweep_misses_no_pair_just_within_the_cutoff(dtype):
     apart -= side * np.round(apart / side)
     within = np.flatnonzero(np.sum(apart**2, axis=1) < cutoff**2)
     assert 0.3 * n < len(within) < 0.7 * n
-    look = partial(sweep, replicas=1, capacity=3 * n, ahead=200)
+    look = partial(search, replicas=1, capacity=3 * n, ahead=200)
     found = set(listed(*look(jnp.asarray(position), side, cutoff)[:3]))
     assert {(k, k + n) for k in within.tolist()} <= found
     # As documented: 1e-6 of the cutoff and of the side.
@@ -182,8 +249,10 @@ def test_a_sweep_misses_no_pair_just_within_the_cutoff(dtype):
     assert tree.query_pairs(cutoff) <= found <= tree.query_pairs(cutoff + 1e-6 * (cutoff + side))
 
 
-def test_a_sweep_over_too_many_is_refused():
+@pytest.mark.parametrize("search, possible", [(sweep, 992), (cells, 192)])
+def test_a_search_over_too_many_is_refused(search, possible):
     position = jax.ShapeDtypeStruct((2**26, 3), jnp.float32)
-    look = partial(sweep, side=1000.0, cutoff=1.0, replicas=1, capacity=9, ahead=2**10)
-    with pytest.raises(ValueError, match="cannot look 1024 particles ahead: .* allow 992 ahead"):
+    look = partial(search, side=1000.0, cutoff=1.0, replicas=1, capacity=9, ahead=2**10)
+    message = f"{search.__name__}.* cannot look 1024 particles ahead: .* allow {possible} ahead"
+    with pytest.raises(ValueError, match=message):
         jax.eval_shape(look, position)

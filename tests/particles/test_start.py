@@ -57,7 +57,7 @@ def test_no_spheres_overlap_and_boxes_differ(dimension, packing):
     assert all(least_distance(box, side) >= CLOSEST for box in boxes)
     assert np.max(np.abs(boxes[0] - boxes[1])) > 1
     # Whoever finds the pairs, and however long the lists are and live.
-    for options in ({"engine": "scipy"}, {"pairs": 1300}, {"skin": 0.3}):
+    for options in ({"engine": "cells"}, {"pairs": 1300}, {"skin": 0.3}):
         np.testing.assert_allclose(placed(side, shape, **options)[1].position, x, atol=1e-9)
 
 

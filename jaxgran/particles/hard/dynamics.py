@@ -17,6 +17,7 @@ from jaxgran._utils import status
 from jaxgran.gradients.rule import Records
 from jaxgran.gradients.tangents import ExchangeTangents
 from jaxgran.particles import neighbours
+from jaxgran.particles.bit_masks import rows_where
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.elements import (
     MAX_KICK,
@@ -28,7 +29,7 @@ from jaxgran.particles.elements import (
 )
 from jaxgran.particles.hard.impacts import MAX_ROUNDS, ImpactWork, execute_impacts
 from jaxgran.particles.hard.prediction import ImpactCandidates, PairRows, Paths, first_impacts
-from jaxgran.particles.neighbours import Pairs, rows_where, select_members
+from jaxgran.particles.neighbours import Pairs, select_members
 from jaxgran.particles.spheres import (
     FATAL,
     AbstractSphereDynamics,
@@ -94,7 +95,8 @@ class HardDynamics(AbstractSphereDynamics):
     """Hard spheres in windows of time.
 
     Attributes:
-        scene, shape, capacity, crowded, listed_by_skin, engine: see `AbstractSphereDynamics`.
+        scene, shape, capacity, crowded, listed_by_skin, engine, compiled_engine: see
+            `AbstractSphereDynamics`.
         share: impacts per particle in a window.
         contact_time: in mean free times; the impact of a sphere within this time of its last one is
             elastic.
@@ -107,6 +109,7 @@ class HardDynamics(AbstractSphereDynamics):
     crowded: Capacity = eqx.field(static=True)
     listed_by_skin: float = eqx.field(static=True)
     engine: str = eqx.field(static=True)
+    compiled_engine: str = eqx.field(static=True)
     share: float = eqx.field(static=True)
     contact_time: Float[Array, ""]
     all_elastic: Bool[Array, ""]

@@ -19,8 +19,9 @@ from jaxgran._utils import status
 from jaxgran.gradients.rule import Records
 from jaxgran.gradients.tangents import ContactTangents, RateSums, component_along
 from jaxgran.particles import neighbours, observables
+from jaxgran.particles.bit_masks import rows_where
 from jaxgran.particles.capacity import Capacity, max_skin
-from jaxgran.particles.neighbours import Pairs, rows_where, select_members
+from jaxgran.particles.neighbours import Pairs, select_members
 from jaxgran.particles.soft.forces import (
     PAIR,
     WALL,
@@ -130,7 +131,8 @@ class SoftDynamics(AbstractSphereDynamics):
     """Viscoelastic spheres in blocks of equal time steps.
 
     Attributes:
-        scene, shape, capacity, crowded, listed_by_skin, engine: see `AbstractSphereDynamics`.
+        scene, shape, capacity, crowded, listed_by_skin, engine, compiled_engine: see
+            `AbstractSphereDynamics`.
         steps_per_contact: steps in the mean contact duration at the current temperature.
         steps_per_block: steps for which the candidates for contact are fixed.
         projection: mean free times between thermal projections of tangents.
@@ -142,6 +144,7 @@ class SoftDynamics(AbstractSphereDynamics):
     crowded: Capacity = eqx.field(static=True)
     listed_by_skin: float = eqx.field(static=True)
     engine: str = eqx.field(static=True)
+    compiled_engine: str = eqx.field(static=True)
     steps_per_contact: int = eqx.field(static=True)
     steps_per_block: int = eqx.field(static=True)
     projection: Float[Array, ""]

@@ -1,0 +1,389 @@
+"""Neighbour lists by cells, for boxes of many particles.
+
+A box is divided into cells whose edge is at least the cutoff. A row is a line of cells along the
+last axis, the longest one, and is divided four times finer. The particles are sorted by row, and in
+a row by cell. Particles in cells of a row one after the other then stand one after the other, too:
+each particle is compared with a contiguous run in its own row, and with one in each of half of the
+neighbouring rows.
+
+Copies of the particles at the ends of a row, its images, continue it periodically at both ends. A
+particle or an image has a slot: its place in the array of all rows with their images.
+"""
+
+import itertools
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, UInt32
+
+from jaxgran.particles.bit_masks import WORD, packed, pairs_where, take
+
+STEPS = 2.0**32
+"""Number of steps of a whole number per side of a box. Differences of such numbers are periodic by
+integer overflow."""
+
+MIN_PER_CELL = 3
+"""Smallest mean number of particles in a cell, before a row is divided finer. Smaller cells would
+need longer arrays."""
+
+CELLS_WITHIN_CUTOFF = 4
+"""Number of cells of a row in an edge of the cells across it. Finer cells shorten the runs, from 3
+to 2.25 edges."""
+
+MIN_AROUND = 3
+"""Number of cells around the box below which a neighbouring cell would be one on both sides."""
+
+MAX_AROUND = 2000
+"""Largest number of cells around the box, by which rounding errors in single precision stay below
+`EDGE_MARGIN`."""
+
+EDGE_MARGIN = 1e-3
+"""Relative margin of the edge of a cell over the cutoff."""
+
+
+OTHERS = {"sweep": "'cells' or 'jax-md'", "cells": "'jax-md'"}
+"""Methods that remain where one cannot be used, for messages."""
+
+
+class CellGrid(NamedTuple):
+    """Division of a box into cells.
+
+    Attributes:
+        around: cells around the box along an axis across the rows; 1 if only one fits.
+        around_row: cells around the box along a row.
+        reach: cells of a row within the cutoff; 0 if the box is one cell.
+        occupied: numbers of cells along each axis between the first and the last particle. Cells
+            beyond them are empty, and have no place in arrays.
+    """
+
+    around: Int[Array, ""]
+    around_row: Int[Array, ""]
+    reach: Int[Array, ""]
+    occupied: Int[Array, "d"]
+
+
+class Rows(NamedTuple):
+    """Rows of cells.
+
+    Attributes:
+        start: number of sorted particles before each cell.
+        length: particles in each row.
+        shift: slot of a sorted particle in each row, less its index.
+    """
+
+    start: Int[Array, "cells"]
+    length: Int[Array, "rows"]
+    shift: Int[Array, "rows"]
+
+
+def reach_in_steps(
+    cutoff: ArrayLike, side: ArrayLike, position: Float[Array, "..."]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return the cutoff in `STEPS`, enlarged by rounding errors, and its square in float32."""
+    reach = jnp.asarray(cutoff / side) * STEPS + 8 + 4 * STEPS * jnp.finfo(position.dtype).eps
+    return reach, (reach * reach * (1 + 1e-6)).astype(jnp.float32)
+
+
+def num_words_ahead(engine: str, ahead: int, num_particles: int, num_runs: int) -> int:
+    """Return the number of words that hold the comparisons of a run.
+
+    Args:
+        engine: name of the method, for the message.
+        ahead: number of particles with which a particle is compared in a run.
+        num_particles: number of particles of all replicas.
+        num_runs: number of runs of each particle.
+
+    Raises:
+        ValueError: if the words of all particles are too many for 32-bit indices.
+    """
+    num_words = max(-(-ahead // WORD), 1)
+    num_runs = num_runs * num_particles
+    if num_words * num_runs >= 2**31:
+        raise ValueError(
+            f"neighbours={engine!r} over {num_particles} particles cannot look {ahead} particles "
+            f"ahead: its indices have 32 bits, which allow {(2**31 - 1) // num_runs * WORD} "
+            f"ahead. Use neighbours={OTHERS[engine]}"
+        )
+    return num_words
+
+
+def expected_run(num_particles: int, cutoff: float, dimension: int) -> float:
+    """Return the expected number of particles in a run of cells of a homogeneous gas.
+
+    Args:
+        num_particles: number of particles in a box.
+        cutoff: over the side of a cube that the particles fill.
+        dimension: dimension d.
+    """
+    most = (num_particles / MIN_PER_CELL) ** (1 / dimension)
+    around = int(min((1 - EDGE_MARGIN) / cutoff, most))
+    if around < MIN_AROUND:
+        return float(num_particles)
+    edges = 2 + 1 / CELLS_WITHIN_CUTOFF
+    return num_particles * edges / around**dimension
+
+
+@partial(jax.jit, static_argnames=("replicas", "capacity", "ahead"))
+def cells(
+    position: Float[Array, "particles d"],
+    side: ArrayLike,
+    cutoff: ArrayLike,
+    *,
+    replicas: int,
+    capacity: int,
+    ahead: int,
+) -> tuple[Int[Array, "{capacity}"], Int[Array, "{capacity}"], Int[Array, ""], Int[Array, ""]]:
+    """Find all pairs closer than a cutoff, in each of several equal periodic boxes.
+
+    The work grows as N. Coordinates are rounded to whole numbers of `STEPS`. One bit per comparison
+    says whether the pair is within the cutoff. A box of fewer than three cells a side is one cell,
+    in which every particle is compared with all following ones.
+
+    Args:
+        position: positions of all particles, replica after replica, in [0, side).
+        side: side of the boxes.
+        cutoff: distance in the same unit, > 0 and at most half a side.
+        replicas: number of boxes.
+        capacity: largest number of pairs that can be returned.
+        ahead: largest number of particles in a run with which a particle can be compared.
+
+    Returns:
+        i and j with i < j; the number of pairs, of which the first `capacity` are returned; and the
+        length of the longest run. If that exceeds `ahead`, pairs are missing. Pairs slightly beyond
+        the cutoff may be included, by at most a part in 10^6 of the cutoff and 10^-8 of the side
+        (in float32: 10^-6).
+
+    Raises:
+        ValueError: if the number of particles times `ahead` is too large for 32-bit indices.
+    """
+    total, dimension = position.shape
+    n = total // replicas
+    num_rows = (3 ** (dimension - 1) + 1) // 2
+    num_words = num_words_ahead("cells", min(ahead, n), total, num_rows)
+    reach, square = reach_in_steps(cutoff, side, position)
+    finite = jnp.all(jnp.isfinite(position))
+    unit = jnp.where(finite, position / side, 0.0).T
+    unit = jnp.where(unit >= 1, 0.0, unit)  # by rounding
+
+    lowest = jnp.min(unit, axis=1)
+    extent = jnp.max(unit, axis=1) - lowest
+    axes = jnp.argsort(extent)
+    unit = unit[axes]
+    lowest = lowest[axes]
+    max_cells = max(n // MIN_PER_CELL, 1)
+    grid = _cell_grid(extent[axes], reach / STEPS, max_cells)
+    place = _places(unit, lowest, grid)
+    row = jnp.repeat(jnp.arange(replicas, dtype=jnp.int32), n)
+    for axis in range(dimension - 1):
+        row = row * grid.occupied[axis] + place[axis]
+    cell, order = _sort_by_cell(row * grid.occupied[-1] + place[-1])
+    rows = _rows(cell, grid, max_cells, replicas, dimension)
+
+    # The slots of the particles and of their images.
+    row = jax.lax.div(cell, grid.occupied[-1])
+    place_in_row = cell - row * grid.occupied[-1]
+    slot = jnp.arange(total, dtype=jnp.int32) + take(rows.shift, row)
+    num_slots = 2 * total + WORD  # each particle has at most one image
+    at_begin = place_in_row < grid.reach
+    at_end = place_in_row >= grid.around_row - grid.reach
+    turns = at_begin.astype(jnp.int32) - at_end.astype(jnp.int32)
+    image = jnp.where(turns == 0, num_slots, slot + turns * take(rows.length, row))
+    particle = jnp.zeros(num_slots, jnp.int32).at[slot].set(order)
+    particle = particle.at[image].set(order, mode="drop")
+
+    steps = [((x - 0.5) * STEPS).astype(jnp.int32) for x in unit]
+    here = [take(x, order) for x in steps]
+    there = [take(x, particle) for x in steps]
+    firsts, counts = _runs(grid, rows, row, place_in_row, slot)
+    longest = jnp.where(finite, jnp.max(jnp.stack(counts)), 0)
+
+    def compare_block(carry: tuple) -> tuple:
+        block, words = carry
+        word = [
+            _near_in_window(here, there, first + WORD * block, count - WORD * block, square)
+            for first, count in zip(firsts, counts, strict=True)
+        ]
+        return block + 1, words.at[block].set(jnp.stack(word))
+
+    def unfinished(carry: tuple) -> Array:
+        block, _ = carry
+        return (WORD * block < longest) & (block < num_words)
+
+    words = jnp.zeros((num_words, num_rows, total), jnp.uint32)
+    _, words = jax.lax.while_loop(unfinished, compare_block, (jnp.zeros((), jnp.int32), words))
+    first = jnp.concatenate(firsts)
+
+    def pair_of(word: Int[Array, "rows"], bit: Int[Array, "rows"]) -> tuple[Array, Array]:
+        block = jax.lax.div(word, jnp.int32(num_rows * total))
+        run = word - block * jnp.int32(num_rows * total)
+        other = take(first, run) + WORD * block + bit
+        return take(order, jax.lax.rem(run, jnp.int32(total))), take(particle, other)
+
+    i, j, count = pairs_where(words.ravel(), capacity, pair_of)
+    return i, j, count, longest
+
+
+def _cell_grid(extent: Float[Array, "d"], reach: ArrayLike, max_cells: int) -> CellGrid:
+    """Return the cells of a box, of at least the cutoff, at most `max_cells` before refinement.
+
+    Args:
+        extent: distance of the last from the first particle along each axis, over the side.
+        reach: cutoff over the side.
+        max_cells: largest number of cells, of which rows have `CELLS_WITHIN_CUTOFF` times as many.
+    """
+
+    def occupied(around: Int[Array, "..."]) -> Int[Array, "d"]:
+        return jnp.minimum((extent * around).astype(jnp.int32) + 1, around)
+
+    def too_many(around: Int[Array, ""]) -> Bool[Array, ""]:
+        return jnp.prod(occupied(around).astype(extent.dtype)) > max_cells
+
+    around = jnp.clip((1 - EDGE_MARGIN) / reach, 1, MAX_AROUND).astype(jnp.int32)
+    around = jax.lax.while_loop(too_many, lambda around: around - around // 10 - 1, around)
+    one_cell = around < MIN_AROUND
+    around = jnp.where(one_cell, 1, around)
+    around_row = jnp.where(one_cell, 1, CELLS_WITHIN_CUTOFF * around)
+    reach_in_cells = jnp.where(one_cell, 0, CELLS_WITHIN_CUTOFF)
+    along_axis = jnp.full(len(extent), around).at[-1].set(around_row)
+    return CellGrid(around, around_row, reach_in_cells.astype(jnp.int32), occupied(along_axis))
+
+
+def _places(
+    unit: Float[Array, "d n"], lowest: Float[Array, "d"], grid: CellGrid
+) -> list[Int[Array, "n"]]:
+    """Return the index of the cell of each particle along each axis."""
+    around = [*[grid.around] * (len(unit) - 1), grid.around_row]
+    axes = zip(unit, lowest, around, grid.occupied, strict=True)
+    return [
+        jnp.clip(((x - low) * number).astype(jnp.int32), 0, occupied - 1)
+        for x, low, number, occupied in axes
+    ]
+
+
+def _sort_by_cell(cell: Int[Array, "n"]) -> tuple[Int[Array, "n"], Int[Array, "n"]]:
+    """Return the cells of the particles in increasing order, and their particles."""
+    n = len(cell)
+    index = jnp.arange(n, dtype=jnp.int32)
+    if jax.dtypes.canonicalize_dtype(jnp.int64) != jnp.int64:
+        cell, index = jax.lax.sort((cell, index), num_keys=1)
+        return cell, index
+    # Sorting one integer of both takes a fifth of the time.
+    bits = max((n - 1).bit_length(), 1)
+    both = jax.lax.sort((cell.astype(jnp.int64) << bits) | index)
+    return (both >> bits).astype(jnp.int32), (both & (2**bits - 1)).astype(jnp.int32)
+
+
+def _rows(
+    cell: Int[Array, "n"], grid: CellGrid, max_cells: int, replicas: int, dimension: int
+) -> Rows:
+    """Return the rows of all boxes, from the cells of the sorted particles."""
+    num_cells = replicas * max_cells * CELLS_WITHIN_CUTOFF
+    counts = jnp.zeros(num_cells + 1, jnp.int32).at[cell + 1].add(1, mode="drop")
+    start = jnp.cumsum(counts, dtype=jnp.int32)
+    # Rows run along the longest axis: they are at most a power of the number of cells.
+    num_rows = replicas * int(max_cells ** ((dimension - 1) / dimension) + 1)
+    along_row = grid.occupied[-1]
+    first = along_row * jnp.arange(num_rows, dtype=jnp.int32)
+
+    def start_of(place: Int[Array, ""]) -> Int[Array, "rows"]:
+        return start.at[first + jnp.minimum(place, along_row)].get(mode="clip")
+
+    begin = start_of(jnp.zeros((), jnp.int32))
+    end = start_of(along_row)
+    images_before = end - start_of(grid.around_row - grid.reach)
+    images_after = start_of(grid.reach) - begin
+    images = jnp.cumsum(images_before + images_after, dtype=jnp.int32)
+    return Rows(start, end - begin, images - images_after)
+
+
+def _runs(
+    grid: CellGrid,
+    rows: Rows,
+    row: Int[Array, "n"],
+    place: Int[Array, "n"],
+    slot: Int[Array, "n"],
+) -> tuple[list[Int[Array, "n"]], list[Int[Array, "n"]]]:
+    """Return the runs with which each sorted particle is compared: first slots and lengths.
+
+    In its own row a run is that of the following particles. The neighbouring rows are half of all,
+    so that each pair of rows occurs once.
+
+    Args:
+        grid: the cells.
+        rows: the rows of cells.
+        row: row of each particle.
+        place: cell of each particle in its row.
+        slot: slot of each particle.
+    """
+    along_row = grid.occupied[-1]
+
+    def slot_of(row: Int[Array, "n"], place: Int[Array, "n"]) -> Int[Array, "n"]:
+        """Return the first slot of cells of rows, which images continue at both ends."""
+        after = (place >= grid.around_row).astype(jnp.int32)
+        turns = after - (place < 0).astype(jnp.int32)
+        inside = jnp.minimum(place - turns * grid.around_row, along_row)
+        start = take(rows.start, row * along_row + inside)
+        return start + take(rows.shift, row) + turns * take(rows.length, row)
+
+    firsts = [slot + 1]
+    counts = [slot_of(row, place + grid.reach + 1) - slot - 1]
+    *across, _ = grid.occupied
+    places = []
+    box = row
+    for number in reversed(across):
+        row_of_axis = jax.lax.div(box, number)
+        places.insert(0, box - row_of_axis * number)
+        box = row_of_axis
+    for step in itertools.product((-1, 0, 1), repeat=len(across)):
+        if step <= (0,) * len(across):
+            continue
+        other = box
+        occupied = grid.reach > 0
+        for x, by, number in zip(places, step, across, strict=True):
+            neighbour = x + by
+            neighbour = jnp.where(neighbour < 0, neighbour + grid.around, neighbour)
+            neighbour = jnp.where(neighbour >= grid.around, neighbour - grid.around, neighbour)
+            occupied = occupied & (neighbour < number)
+            other = other * number + neighbour
+        other = jnp.where(occupied, other, 0)
+        first = slot_of(other, place - grid.reach)
+        firsts.append(first)
+        counts.append(jnp.where(occupied, slot_of(other, place + grid.reach + 1) - first, 0))
+    return firsts, counts
+
+
+def _near_in_window(
+    here: list[Int[Array, "n"]],
+    there: list[Int[Array, "slots"]],
+    first: Int[Array, "n"],
+    count: Int[Array, "n"],
+    square: Float[Array, ""],
+) -> UInt32[Array, "n"]:
+    """Return which of 32 slots from `first` on, and of the first `count`, are within the cutoff.
+
+    Args:
+        here: coordinates of the particles, as whole numbers of `STEPS`.
+        there: coordinates by slot.
+        first: first slot for each particle.
+        count: number of slots with which the particle is compared.
+        square: of the cutoff in `STEPS`.
+    """
+    places = jnp.arange(WORD, dtype=jnp.int32)
+    distance2 = jnp.zeros((len(first), WORD), jnp.float32)
+    for x, others in zip(here, there, strict=True):
+        apart = (_windows(others, first) - x[:, None]).astype(jnp.float32)
+        distance2 = distance2 + apart * apart
+    return packed((distance2 < square) & (places[None] < count[:, None]))
+
+
+def _windows(values: Int[Array, "slots"], first: Int[Array, "n"]) -> Int[Array, "n 32"]:
+    """Return 32 successive values for each index of a first one."""
+    # Slices, which the compiler reads faster than values at 32 indices.
+    dimensions = jax.lax.GatherDimensionNumbers(
+        offset_dims=(1,), collapsed_slice_dims=(), start_index_map=(0,)
+    )
+    return jax.lax.gather(
+        values, first[:, None], dimensions, (WORD,), mode=jax.lax.GatherScatterMode.CLIP
+    )
