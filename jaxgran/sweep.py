@@ -93,8 +93,9 @@ def sweep(
             ``jax.vmap(lambda a: gas.replace(dissipative_constant=a))(values)``. A list of floats
             (coefficients of a series, sides of a box) has the axis of members first.
         times: t, s, increasing and >= 0, shape (times,).
-        model: a `jaxgran.AbstractModel`, by default `jaxgran.KineticTheory()`. Arrays of particle
-            models are sized for the member with the largest need, unless `sized_for` was called.
+        model: a `jaxgran.extend.AbstractModel`, by default `jaxgran.KineticTheory()`. Arrays of
+            particle models are sized for the member with the largest need, unless `sized_for` was
+            called.
         key: the random key, from which `jax.random.fold_in` derives one key for each member; or an
             array with one key for each member. By default `jax.random.key(0)`. The key of a member
             does not depend on the number of members.

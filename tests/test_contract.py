@@ -54,7 +54,7 @@ OF_SOFT_SPHERES = ("friction", "container", "drag")
 class Case:
     """A model, a gas for it, the float in which curves are differentiated, and its elements."""
 
-    model: jaxgran.AbstractModel
+    model: jaxgran.extend.AbstractModel
     elements: tuple[str, ...]
     gas: jaxgran.Gas = BEADS
     parameter: str = "dissipative_constant"

@@ -62,7 +62,7 @@ class OfMass(NotReduced, ReducedLaw):
     """A law with a float called like one of the gas."""
 
     mass: float = 1.0
-    domains = {"mass": jaxgran.Domain()}
+    domains = {"mass": jaxgran.extend.Domain()}
 
     def restitution(self, normal_speed):
         return 0.9 * jnp.ones_like(normal_speed)
@@ -88,7 +88,7 @@ class Open(RestitutionLaw):
     """A law whose float has a range of its own."""
 
     coefficient: float
-    domains = {"coefficient": jaxgran.Domain(0.0, 1.0)}
+    domains = {"coefficient": jaxgran.extend.Domain(0.0, 1.0)}
 
     def restitution(self, normal_speed):
         return self.coefficient
@@ -212,12 +212,18 @@ SCENES = [
     (lambda: jaxgran.SoftSpheres(10, projection=0.0), "projection must"),
     (lambda: jaxgran.SoftSpheres(10, steps_per_contact=5), "steps_per_contact"),
     # numbers
-    (lambda: jaxgran.Domain(0.0).check("speed", "steel", "Give m/s."), "in .0, inf., got .* Give"),
     (
-        lambda: jaxgran.Domain(0.0, 1.0, high_allowed=True).check("share", [1.0, 0.0]),
+        lambda: jaxgran.extend.Domain(0.0).check("speed", "steel", "Give m/s."),
+        "in .0, inf., got .* Give",
+    ),
+    (
+        lambda: jaxgran.extend.Domain(0.0, 1.0, high_allowed=True).check("share", [1.0, 0.0]),
         r"share must lie in \(0, 1\], got 0",
     ),
-    *((partial(jaxgran.Domain().check, "share", x), "share must lie in") for x in (NAN, INF, -INF)),
+    *(
+        (partial(jaxgran.extend.Domain().check, "share", x), "share must lie in")
+        for x in (NAN, INF, -INF)
+    ),
     (lambda: jaxgran.CoolingCurve(["steel"], [1.0]), "expected a number or an array of numbers"),
     (lambda: jaxgran.CoolingCurve([object()], [1.0]), "expected a number or an array of numbers"),
     (lambda: jaxgran.CoolingCurve([1.0, [2.0]], [1.0]), "expected a number or an array of numbers"),

@@ -48,7 +48,7 @@ def beads(law: Any = None, packing_fraction: float = 0.03, dimension: int = 3, *
     """Return 3 mm beads, viscoelastic without a law or with a constant restitution."""
     if law is None:
         law = jaxgran.Viscoelastic(6e10, 0.24, 2.5e-7)
-    elif not isinstance(law, jaxgran.RestitutionLaw):
+    elif not isinstance(law, jaxgran.extend.RestitutionLaw):
         law = jaxgran.ConstantRestitution(law)
     return jaxgran.Gas(
         law,

@@ -76,7 +76,7 @@ def times() -> np.ndarray:
     return np.geomspace(1e-1, 1e4, 50) * float(scene().mean_free_time)
 
 
-def at(constant, model: jaxgran.AbstractModel | None = None) -> jax.Array:
+def at(constant, model: jaxgran.extend.AbstractModel | None = None) -> jax.Array:
     """Return T with a dissipative constant."""
     gas = scene().replace(dissipative_constant=constant)
     return jaxgran.cool(gas, jnp.asarray(times()), model=model).temperature

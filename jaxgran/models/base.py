@@ -46,7 +46,7 @@ class AbstractModel(eqx.Module):
 
     >>> jaxgran.KineticTheory().name, jaxgran.DSMC(1000).stochastic
     ('kinetic theory', True)
-    >>> isinstance(jaxgran.HardSpheres(100), jaxgran.AbstractModel)
+    >>> isinstance(jaxgran.HardSpheres(100), jaxgran.extend.AbstractModel)
     True
     """
 

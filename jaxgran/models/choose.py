@@ -99,7 +99,7 @@ def choose_model(
     ``|d ln T/dt| int_0^t e dt'`` of T. Contributions to e(t) are Enskog's collision frequency,
     contacts that last and overlap, and, in a box of known size, the flow that grows in it:
     kinetic theory and DSMC count its energy as heat, which cools. Particle models have noise. Each
-    model estimates its own error (`jaxgran.AbstractModel.estimated_error`).
+    model estimates its own error (`jaxgran.extend.AbstractModel.estimated_error`).
 
     Args:
         gas: the scene.

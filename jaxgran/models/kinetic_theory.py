@@ -326,7 +326,7 @@ class KineticTheory(AbstractModel):
         )
 
     def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
-        """Return the cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
+        """Return the cooling curve at the given times, s, as `AbstractModel.simulate` describes."""
         size = times.size
         padded = pad_to(times, padded_length(size))
         # Traced twice if it were compiled within another program.

@@ -97,8 +97,8 @@ def test_gravity_is_said_to_be_taken_as_absent_between_walls():
         assert found == (gas is between)
 
 
-EDGE = jaxgran.Limitation("the gas is dense", False, "Take positions.")
-DECISIVE = jaxgran.Limitation("contacts last", True, "Take contacts.")
+EDGE = jaxgran.extend.Limitation("the gas is dense", False, "Take positions.")
+DECISIVE = jaxgran.extend.Limitation("contacts last", True, "Take contacts.")
 CONSISTENT = " is consistent with this curve"
 AT_EDGE = ".* The scene is at the edge of the model's validity."
 NOT_EXPLAINED = " is not consistent with this curve: do not trust the estimates."

@@ -64,7 +64,7 @@ def test_series_of_viscoelastic_spheres():
     np.testing.assert_allclose(law.coefficients[:2], first_two, rtol=1e-14)
 
 
-class Plastic(jaxgran.RestitutionLaw):
+class Plastic(jaxgran.extend.RestitutionLaw):
     """Losses begin at a yield speed; in m/s, and with no other member than its eps."""
 
     yield_speed: float
@@ -87,7 +87,7 @@ def test_a_law_of_the_speed_alone_is_one_function():
 
 
 def test_a_law_may_give_one_number_for_all_speeds():
-    class Same(jaxgran.RestitutionLaw):
+    class Same(jaxgran.extend.RestitutionLaw):
         coefficient: float
 
         def restitution(self, normal_speed):

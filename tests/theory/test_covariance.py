@@ -137,7 +137,7 @@ def test_energies_of_rough_impacts_are_those_of_sampled_pairs(dimension, frictio
 
 @pytest.mark.parametrize("power", [0.0, 0.2, 0.5])
 def test_spread_of_losses_of_a_power_law(power):
-    class Loss(jaxgran.RestitutionLaw):
+    class Loss(jaxgran.extend.RestitutionLaw):
         power: float
 
         def restitution(self, normal_speed):
