@@ -159,7 +159,7 @@ def sweep(
         name = type(model).__name__
         raise ValueError(f"{name} supports no member of this sweep; member 0: {why_unsupported(0)}")
     models = [model]
-    if isinstance(model, AbstractSpheres) and model.plan is None:
+    if isinstance(model, AbstractSpheres) and model._sizes is None:
         sized_for = [_member(gases, i) for i in (stand_in, *supported)]
         models = [_sized_for_all(model, sized_for, spare) for spare in SPARE_FACTORS]
     run_member = partial(_run_member, model=models[0], times=times, save=save)
@@ -294,14 +294,19 @@ def _empty(name: str, dtype: Any) -> Any:
 
 def _sized_for_all(model: AbstractSpheres, gases: Sequence[Gas], spare: float) -> AbstractSpheres:
     """Return a model with arrays long enough, and blocks of steps short enough, for all gases."""
-    plans = [plan for gas in gases if (plan := model.sized_for(gas, spare).plan) is not None]
-    steps = min(plan.steps for plan in plans)
-    run, equilibration = (
-        Capacity(*map(max, zip(*capacities, strict=True)))
-        for capacities in zip(*((p.capacity, p.equilibration_capacity) for p in plans), strict=True)
+    sized = [model.sized_for(gas, spare) for gas in gases]
+    needs = [model._sizes for model in sized if model._sizes is not None]
+    sizes = needs[0]._replace(
+        steps=min(need.steps for need in needs),
+        capacity=_largest([need.capacity for need in needs]),
+        equilibration_capacity=_largest([need.equilibration_capacity for need in needs]),
     )
-    plan = plans[0]._replace(steps=steps, capacity=run, equilibration_capacity=equilibration)
-    return dataclasses.replace(model, plan=plan)
+    return dataclasses.replace(model, _sizes=sizes)
+
+
+def _largest(capacities: Sequence[Capacity]) -> Capacity:
+    """Return a capacity that is enough for all of some runs."""
+    return Capacity(*np.max(capacities, axis=0).tolist())
 
 
 def _run_member(gas: Gas, key: PRNGKeyArray, *, model, times, save) -> CoolingCurve:

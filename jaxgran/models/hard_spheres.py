@@ -14,7 +14,7 @@ from jaxgran.data.curve import Particles
 from jaxgran.models import checks
 from jaxgran.models.base import Limitation
 from jaxgran.models.error_model import ErrorModel
-from jaxgran.models.spheres import AbstractSpheres, Plan
+from jaxgran.models.spheres import AbstractSpheres, ArraySizes
 from jaxgran.particles.capacity import capacities
 from jaxgran.particles.hard.dynamics import (
     ALLOWED_OVERLAP,
@@ -73,7 +73,6 @@ class HardSpheres(AbstractSpheres):
             differences of whole runs (`jaxgran.gradients.differences`), 0.3 for most uses. They
             need two more runs for each number of the law and have noise, but no bias in a gas that
             clusters. None for projected derivatives.
-        plan: static sizes of arrays, see `sized_for`.
 
     Derivatives of T, T_rot and collisions are known in every float of the gas and in the times,
     forward and reverse, for any law; of smooth spheres also those of the dissipated energy. The gas
@@ -109,7 +108,7 @@ class HardSpheres(AbstractSpheres):
     start: Particles | None = None
     neighbours: str = eqx.field(static=True, default="auto")
     differences: float | None = eqx.field(static=True, default=None)
-    plan: Plan | None = eqx.field(static=True, default=None)
+    _sizes: ArraySizes | None = eqx.field(static=True, default=None)
 
     listed_by_skin: ClassVar[float] = 7.0
     transforms_time: ClassVar[bool] = True
@@ -171,17 +170,17 @@ class HardSpheres(AbstractSpheres):
         return sphere_scene(gas, self.num_particles, material)
 
     def motion(
-        self, scene: SphereScene, shape: tuple[int, int, int], plan: Plan, engine: str
+        self, scene: SphereScene, shape: tuple[int, int, int], sizes: ArraySizes, engine: str
     ) -> HardDynamics:
         """Return the motion of the spheres."""
         return HardDynamics(
             scene=scene,
             shape=shape,
-            capacity=plan.capacity,
-            crowded=plan.equilibration_capacity,
+            capacity=sizes.capacity,
+            crowded=sizes.equilibration_capacity,
             listed_by_skin=self.listed_by_skin,
             engine=engine,
-            share=plan.steps,
+            share=sizes.steps,
             contact_time=concrete_array(self.contact_time, scene.side.dtype),
             all_elastic=concrete_array(False),
         )
@@ -190,9 +189,9 @@ class HardSpheres(AbstractSpheres):
         """Return nothing: derivatives are known in all numbers."""
         return {}
 
-    def planned(
+    def needed_sizes(
         self, scene: SphereScene, dimension: int, replicas: int, spare: float | None = None
-    ) -> Plan:
+    ) -> ArraySizes:
         """Return static sizes; capacities were measured for phi = .001 to .4 (disks: .6) and
         N = 125 to 50 000."""
         d = dimension
@@ -210,4 +209,4 @@ class HardSpheres(AbstractSpheres):
         extra = 1.3 * max(around.in_contact - 0.4, 0.0)  # random positions have more near pairs
         capacity, crowded = capacities(expected, around.lookahead, spare or 1.15, extra, n)
         made_for = ("num_particles", self.num_particles), ("replicas", self.replicas)
-        return Plan(made_for, share, capacity, crowded)
+        return ArraySizes(made_for, share, capacity, crowded)

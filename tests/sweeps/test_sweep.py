@@ -196,8 +196,8 @@ def test_a_chunk_is_run_again_if_a_member_overflows_its_arrays(monkeypatch):
     def short_below_1(model, gases, spare):
         model = sized_for_all(model, gases, 2.0)
         names = "capacity", "equilibration_capacity"
-        few = {name: getattr(model.plan, name)._replace(pairs=20) for name in names}
-        short = dataclasses.replace(model, plan=model.plan._replace(**few))
+        few = {name: getattr(model._sizes, name)._replace(pairs=20) for name in names}
+        short = dataclasses.replace(model, _sizes=model._sizes._replace(**few))
         return short if spare < 1 else model
 
     def curves(*factors):
