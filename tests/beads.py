@@ -35,6 +35,11 @@ def theory_curve(gas, taus, **settings) -> jaxgran.CoolingCurve:
     return jaxgran.cool(gas, taus * gas.mean_free_time, model=jaxgran.KineticTheory(**settings))
 
 
+def without(*names) -> frozenset[str]:
+    """All corrections of kinetic theory but these."""
+    return jaxgran.KineticTheory.all_corrections - {*names}
+
+
 def lattice(gas, n, replicas=1) -> jaxgran.Particles:
     """Spheres near the sites of a cubic lattice, at T: a start that needs no equilibration."""
     rng, d, side = np.random.default_rng(0), gas.dimension, float(gas.box_side(n))

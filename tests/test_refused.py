@@ -12,7 +12,8 @@ import pytest
 
 import jaxgran
 from experiments.fit.own_model import HaffLaw
-from jaxgran import ReducedLaw, RestitutionLaw, observables
+from jaxgran import observables
+from jaxgran.extend import ReducedLaw, RestitutionLaw
 from tests.beads import SI, glass_beads, hard_gas, spheres
 
 NAN, INF = float("nan"), float("inf")
@@ -195,8 +196,8 @@ SCENES = [
     (lambda: cool(HOT), "T_0, to which the gas heats up.*SoftSpheres"),
     (lambda: jaxgran.KineticTheory(initial_sonine=-0.5), "initial_sonine must lie in .*got -0.5"),
     (
-        lambda: jaxgran.KineticTheory(initial_sonine=0.1, sonine=False),
-        "initial_sonine = 0.1 needs sonine=True",
+        lambda: jaxgran.KineticTheory(initial_sonine=0.1, corrections=()),
+        'initial_sonine = 0.1 needs "sonine" among',
     ),
     # settings of models
     (lambda: jaxgran.KineticTheory(order=4), "order must be 2 or 3, got 4"),
@@ -302,7 +303,10 @@ CALLS = [
     ),
     (lambda: jaxgran.Viscoelastic("5e7", 0.2, 1e-6), "got '5e7'"),
     (lambda: GAS.replace(mass=True), "mass must be a number"),
-    (lambda: jaxgran.KineticTheory(sonine="no"), "must be True or False"),
+    *(
+        (partial(jaxgran.KineticTheory, x), "corrections must be a collection of some of")
+        for x in ("sonine", ["sonine", "heat"], False, [[]])
+    ),
     (lambda: jaxgran.DSMC(50, replicas=True), "whole number >= 1"),
     (lambda: jaxgran.SoftSpheres(20, projection="x"), "number"),
     (lambda: jaxgran.KineticTheory(rtol=-1), "rtol must lie in"),

@@ -34,8 +34,10 @@ import jaxgran
 from experiments.support.record import DATA, Options, run_parts
 from experiments.support.scenes import cool
 
-THEORY = jaxgran.KineticTheory(softness=False)
-ENSKOG = jaxgran.KineticTheory(softness=False, correlations=False)
+THEORY = jaxgran.KineticTheory(corrections=jaxgran.KineticTheory.all_corrections - {"softness"})
+ENSKOG = jaxgran.KineticTheory(
+    corrections=jaxgran.KineticTheory.all_corrections - {"softness", "correlations"}
+)
 STORED = DATA / "run_statistics.npz"
 DEPTH = 3.5
 """Largest ln(T_0/T) of gases that cool."""

@@ -61,7 +61,7 @@ CURVE = EXAMPLE_FILES["dilute"]
 TASKS = "reference", "fit", "lengths", "command", "SoftSpheres", "HardSpheres", "DSMC"
 RTOL, SCIPY_RTOL = 1e-7, 1e-9  # both give the same accuracy
 REFERENCE = "first Jacobian"
-SAME_EQUATIONS = {"order": 2, "softness": False, "correlations": False}
+SAME_EQUATIONS = {"order": 2, "corrections": {"sonine", "diffusion", "spin_cumulants"}}
 """Options for which kinetic theory solves the equations that are written here for SciPy."""
 
 

@@ -133,8 +133,8 @@ def check_softness(gas: Gas, factor: ArrayLike, hottest: ArrayLike = 1.0) -> Non
         place = "T_0" if speed == 1 else f"{speed**2:.3g} T_0, to which the gas heats up"
         raise ValueError(
             f"spheres overlap by {overlap:.2g} diameters at {place}, where the softness "
-            "correction is invalid. Check that youngs_modulus is in Pa, or use SoftSpheres or "
-            "KineticTheory(softness=False)."
+            "correction is invalid. Check that youngs_modulus is in Pa, use SoftSpheres, or leave "
+            '"softness" out of the corrections of KineticTheory.'
         )
 
 

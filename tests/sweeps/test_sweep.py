@@ -13,7 +13,7 @@ import pytest
 
 import jaxgran
 from jaxgran import observables
-from tests.beads import assert_same, glass_beads
+from tests.beads import assert_same, glass_beads, without
 from tests.sweeps.process import TIMES, members
 
 GAS, GASES = glass_beads(), members(5)
@@ -145,7 +145,7 @@ def test_a_finished_store_is_read(store, store_of_saved):
     ("changed", "message"),
     [
         ({"times": (0.1, 1.0, 11.0)}, "another sweep, with another times. Name another store"),
-        ({"model": jaxgran.KineticTheory(softness=False)}, "with another model"),
+        ({"model": jaxgran.KineticTheory(corrections=without("softness"))}, "with another model"),
         ({"key": jax.random.key(7)}, "with another key"),
         ({"gases": jax.tree.map(lambda x: x[:4], GASES)}, "with another gases, key"),
         ({"chunk": 3}, "with another chunk"),

@@ -16,9 +16,9 @@ from jaxgran.scene.gas import reduced_scene
 from jaxgran.theory import covariance
 from jaxgran.theory.averages import loss_moments, rough_energy_moments
 from jaxgran.theory.equations import Density, Spins, element_rates
-from tests.beads import glass_beads, hard_gas
+from tests.beads import glass_beads, hard_gas, without
 
-THEORY = jaxgran.KineticTheory(softness=False, correlations=False)
+THEORY = jaxgran.KineticTheory(corrections=without("softness", "correlations"))
 ROUGH = jaxgran.Rough(0.2, rotational_temperature=6e-3)
 SLIDING = replace(ROUGH, friction=jnp.asarray(0.2))
 WALLS = jaxgran.Walls([0.05, 0.06, 0.08], restitution=0.8, tangential_restitution=0.2)
