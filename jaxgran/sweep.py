@@ -11,7 +11,6 @@ import hashlib
 import json
 import os
 import shutil
-import time
 import warnings
 from collections.abc import Callable, Sequence
 from functools import cache, partial
@@ -23,6 +22,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, ArrayLike, Float, Key, PRNGKeyArray
 from tqdm import tqdm
@@ -44,9 +44,6 @@ from jaxgran.scene.parameters import FLOAT_UNITS
 
 DEFAULT_CHUNK = {False: 1024, True: 16}
 """Members per chunk, by whether the model is stochastic."""
-
-POLL_SECONDS = 0.3
-"""Interval at which a process that has finished its chunks looks for those of the others."""
 
 DEVICE, MEMBER = "device", "member"
 
@@ -81,7 +78,7 @@ def sweep(
     distributed over the processes of a `jax.distributed` job: process p computes the chunks c with
     c = p modulo the number of processes. Members are independent, so the processes share nothing
     but the store. When a process has finished its own chunks, it waits for all others and returns
-    the complete result. If a process dies, JAX ends the others after
+    the complete result. If a process dies, JAX ends the others, at the latest after
     ``heartbeat_timeout_seconds`` of `jax.distributed.initialize`. The same call then computes the
     missing chunks, with any number of processes.
 
@@ -129,7 +126,8 @@ def sweep(
     (2, 4)
     """
     check_bool(progress=progress)
-    times, (gases, keys, swept) = checked_times(times), _checked_members(gases, key)
+    times = checked_times(times)
+    gases, keys, swept = _checked_members(gases, key)
     model = checks.checked_model(KineticTheory() if model is None else model)
     model.check_save(save)
     if not isinstance(store, str | os.PathLike | None):
@@ -138,10 +136,12 @@ def sweep(
         raise ValueError(
             f"a sweep over {jax.process_count()} processes needs store, a folder that all share"
         )
-    number, path = len(keys), None if store is None else Path(store)
+    number = len(keys)
+    path = None if store is None else Path(store)
+    stored = None if path is None else _stored_identity(path)
     if chunk is not None:
         chunk = min(checked_int("chunk", chunk, 1), number)
-    elif path is not None and (stored := _stored_identity(path)):
+    elif stored is not None:
         chunk = int(stored["chunk"])
     else:
         chunk = min(DEFAULT_CHUNK[model.stochastic], -(-number // jax.process_count()))
@@ -154,14 +154,14 @@ def sweep(
             return str(error)
         return None
 
-    supported = (i for i in range(number) if why_unsupported(i) is None)
-    if (stand_in := next(supported, None)) is None:
+    stand_in = next((i for i in range(number) if why_unsupported(i) is None), None)
+    if stand_in is None:
         name = type(model).__name__
         raise ValueError(f"{name} supports no member of this sweep; member 0: {why_unsupported(0)}")
     models = [model]
     if isinstance(model, AbstractSpheres) and model._sizes is None:
-        sized_for = [_member(gases, i) for i in (stand_in, *supported)]
-        models = [_sized_for_all(model, sized_for, spare) for spare in SPARE_FACTORS]
+        supported = [_member(gases, i) for i in range(number) if why_unsupported(i) is None]
+        models = [_sized_for_all(model, supported, spare) for spare in SPARE_FACTORS]
     run_member = partial(_run_member, model=models[0], times=times, save=save)
     like = jax.eval_shape(run_member, *_rows((gases, keys), stand_in))
     arrays: Any = {
@@ -187,13 +187,13 @@ def sweep(
             )
         chosen = _rows((gases, keys), np.where(unsupported, stand_in, members))
         computed = _run_chunk(models, chosen, times, chunk, save)
-        computed[STATUS][unsupported] = status.UNSUPPORTED.bit
-        for name in sorted(computed, key=STATUS.__eq__):  # the status last
-            if name != STATUS:
-                computed[name][unsupported] = _empty(name, computed[name].dtype)
-            arrays[name][rows] = computed[name]
-    while np.any(arrays[STATUS][:] == MISSING):  # JAX ends this process if another one dies
-        time.sleep(POLL_SECONDS)
+        faults = computed.pop(STATUS)
+        faults[unsupported] = status.UNSUPPORTED.bit
+        for name, values in computed.items():
+            values[unsupported] = _empty(name, values.dtype)
+            arrays[name][rows] = values
+        arrays[STATUS][rows] = faults  # last: the chunk is complete now
+    _wait_for_all("jaxgran sweep: all chunks are finished")
     known = {name: jnp.asarray(arrays[name][:]) for name in _records(like)}
     return jax.vmap(lambda known: curves.from_arrays({"times": times} | known, like))(known)
 
@@ -333,7 +333,8 @@ def _run_chunk(
     The last member is repeated until every device has the same number. If members of a particle
     model overflow their arrays, the chunk is run again with the next model.
     """
-    number, mesh = len(members[1]), Mesh(np.array(jax.local_devices()[:chunk]), (DEVICE,))
+    number = len(members[1])
+    mesh = Mesh(np.array(jax.local_devices()[:chunk]), (DEVICE,))
     rows = np.minimum(np.arange(-(-chunk // mesh.size) * mesh.size), number - 1)
     arrays: dict[str, np.ndarray] = {}
     for model in models:
@@ -370,9 +371,11 @@ def _run_on_devices(model: AbstractModel, members: Any, times: Array, mesh: Mesh
 
 def _identity(chunk: int, parts: dict[str, Any]) -> dict[str, Any]:
     """Return what identifies a sweep: the chunk, the version, and a hash of each other part."""
-    descriptions = {name: json.dumps(describe_run(part=part)) for name, part in parts.items()}
-    hashes = {name: hashlib.sha256(x.encode()).hexdigest()[:16] for name, x in descriptions.items()}
-    return {"chunk": chunk, "version of jaxgran": version("jaxgran")} | hashes
+    identity = {"chunk": chunk, "version of jaxgran": version("jaxgran")}
+    for name, part in parts.items():
+        words = json.dumps(describe_run(part=part))
+        identity[name] = hashlib.sha256(words.encode()).hexdigest()[:16]
+    return identity
 
 
 def _labels(gases: Gas, swept: list[str], times: np.ndarray) -> dict[str, tuple]:
@@ -387,7 +390,8 @@ def _labels(gases: Gas, swept: list[str], times: np.ndarray) -> dict[str, tuple]
         label = f"initial_{name}" if name in curves.QUANTITIES else name
         dims = (MEMBER, *(f"{label}_{k}" for k in range(values.ndim - 1)))
         if np.all(values == values[:1]):
-            dims, values = dims[1:], values[0]
+            dims = dims[1:]
+            values = values[0]
         labels[label] = dims, values, {"units": FLOAT_UNITS.get(name, "1")}
     return labels
 
@@ -400,12 +404,16 @@ def _open_store(
     are_particles: bool,
 ) -> Any:
     """Return the Zarr group of a sweep; create it, with all labels and no finished chunk."""
-    zarr, xarray = (curves.import_extra(name, "sweep") for name in ("zarr", "xarray"))
+    zarr = curves.import_extra("zarr", "sweep")
+    xarray = curves.import_extra("xarray", "sweep")
     if _stored_identity(path) is None and jax.process_index() == 0:
-        variables, encoding = {}, {}
+        variables = {}
+        encoding = {}
         for name, values in empty.items():
-            dims, attributes = (), {"long_name": "faults, see jaxgran.explain_status"}
-            if name != STATUS:
+            if name == STATUS:
+                dims = ()
+                attributes = {"long_name": "faults, see jaxgran.explain_status"}
+            else:
                 dims, attributes = curves.label_of(name, values.ndim - 1, are_particles)
             variables[name] = (MEMBER, *dims), values, attributes
             fill = _empty(name, values.dtype)
@@ -419,8 +427,8 @@ def _open_store(
             os.rename(temporary, path)  # complete, or not there
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
-    while (stored := _stored_identity(path)) is None:
-        time.sleep(POLL_SECONDS)
+    _wait_for_all("jaxgran sweep: the store is there")
+    stored = _stored_identity(path) or {}
     differ = [name for name in identity if stored.get(name) != identity[name]]
     if differ:
         raise ValueError(
@@ -428,6 +436,12 @@ def _open_store(
             "store, or remove it to start again."
         )
     return zarr.open_group(path, mode="r+")
+
+
+def _wait_for_all(event: str) -> None:
+    """Wait until all processes are here; JAX ends this process if another one dies."""
+    if jax.process_count() > 1:
+        multihost_utils.sync_global_devices(event)
 
 
 def _stored_identity(path: Path) -> dict[str, Any] | None:
