@@ -1,9 +1,9 @@
 """Sweeps: the cooling curves of many gases, over devices and processes, with an optional store.
 
-The members of a sweep are gases that share a structure and differ in floats and keys. Each process
-runs chunks of members in one compiled program on its devices. A store is a Zarr group, labelled for
-xarray, whose arrays are divided into the same chunks. The status of a chunk is written last: until
-then it is `MISSING`, and a sweep that is resumed computes the chunk.
+The members of a sweep are gases that share a structure and differ in parameters and keys. Each
+process runs chunks of members in one compiled program on its devices. A store is a Zarr group,
+labelled for xarray, whose arrays are divided into the same chunks. The status of a chunk is written
+last: until then it is `MISSING`, and a sweep that is resumed computes the chunk.
 """
 
 import dataclasses
@@ -40,7 +40,7 @@ from jaxgran.models.spheres import AbstractSpheres
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.run import block_until_ready
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.parameters import FLOAT_UNITS
+from jaxgran.scene.parameters import PARAMETER_UNITS
 
 DEFAULT_CHUNK = {False: 1024, True: 16}
 """Members per chunk, by whether the model is stochastic."""
@@ -58,7 +58,7 @@ ATTRIBUTE = "sweep"
 """Attribute of a store that identifies the sweep."""
 
 WALL_SIDE = "wall_side"
-"""The only float that may be one number or d numbers."""
+"""The only parameter that may be one number or d numbers."""
 
 
 def sweep(
@@ -86,7 +86,7 @@ def sweep(
     Members that the model does not support are reported in a warning.
 
     Args:
-        gases: a gas in which some or all floats have a leading axis of members, as returned by
+        gases: a gas in which some or all parameters have a leading axis of members, as returned by
             ``jax.vmap(lambda a: gas.replace(dissipative_constant=a))(values)``. A list of floats
             (coefficients of a series, sides of a box) has the axis of members first.
         times: t, s, increasing and >= 0, shape (times,).
@@ -101,10 +101,11 @@ def sweep(
             ``curves.saved``, ``curves.saved_error`` and ``curves.replicas.saved``. Integers and
             booleans of an unsupported member are 0.
         store: path of a Zarr group that `xarray.open_zarr` reads: arrays have the names of
-            `CoolingCurve.to_xarray` and a first dimension member, and swept floats and units are
-            labels. Each chunk is written when it ends; until then its status is -1. If the group is
-            the store of the same sweep, only missing chunks are computed. Needs the extra `sweep`,
-            and a file system that all processes share. None keeps the results in memory only.
+            `CoolingCurve.to_xarray` and a first dimension member, and swept parameters and units
+            are labels. Each chunk is written when it ends; until then its status is -1. If the
+            group is the store of the same sweep, only missing chunks are computed. Needs the extra
+            `sweep`, and a file system that all processes share. None keeps the results in memory
+            only.
         chunk: number of members computed and written together, >= 1; by default that of an existing
             store, otherwise 16 for a stochastic model and 1024 for others.
         progress: show a progress bar on a terminal.
@@ -114,11 +115,11 @@ def sweep(
         shape (members, times). Without particles.
 
     Raises:
-        ValueError: if the leading axes of the floats have different lengths, if floats of all
-            members are outside their range, if the model supports no member, for several processes
-            without a store, if `save` is not a function of particles or returns values without
-            names, or if the store belongs to another sweep or another version of jaxgran. Nothing
-            is overwritten.
+        ValueError: if the leading axes of the parameters have different lengths, if parameters of
+            all members are outside their range, if the model supports no member, for several
+            processes without a store, if `save` is not a function of particles or returns values
+            without names, or if the store belongs to another sweep or another version of jaxgran.
+            Nothing is overwritten.
         OSError: if the store cannot be written.
 
     >>> gases = jax.vmap(lambda a: gas.replace(dissipative_constant=a))(jnp.array([1e-6, 3e-6]))
@@ -199,7 +200,7 @@ def sweep(
 
 
 def _checked_members(gases: Any, key: Any) -> tuple[Gas, Key[Array, "members"], list[str]]:
-    """Return gases and keys with an axis of members, and the names of floats that were given one.
+    """Return gases and keys with an axis of members, and the names of the swept parameters.
 
     Raises:
         ValueError: for anything but a gas, for leading axes of different lengths, and if nothing
@@ -224,15 +225,15 @@ def _checked_members(gases: Any, key: Any) -> tuple[Gas, Key[Array, "members"], 
     lengths |= {name: len(gases.value(name)) for name in swept}
     if not lengths:
         raise ValueError(
-            f"no float of gases has a leading axis, and there is only one key. Build gases by {how}"
-            ", give an array of keys, or use jaxgran.cool for one gas."
+            "no parameter of gases has a leading axis, and there is only one key. Build gases by "
+            f"{how}, give an array of keys, or use jaxgran.cool for one gas."
         )
     number = next(iter(lengths.values()))
     if set(lengths.values()) != {number} or number == 0:
         listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
         raise ValueError(
             f"the leading axes of a sweep must have one length, at least 1, got {listed}. Give "
-            "every swept float one value for each member."
+            "every swept parameter one value for each member."
         )
     if keys.ndim == 0:
         keys = jax.vmap(partial(jax.random.fold_in, keys))(jnp.arange(number))
@@ -249,11 +250,11 @@ def _checked_members(gases: Any, key: Any) -> tuple[Gas, Key[Array, "members"], 
 
 
 def _swept_names(gases: Gas) -> list[str]:
-    """Return the names of the floats that have an axis of members.
+    """Return the names of the parameters that have an axis of members.
 
     Raises:
-        ValueError: for floats with further axes, and for wall sides that may belong to one box or
-            to several cubes.
+        ValueError: for parameters with further axes, and for wall sides that may belong to one box
+            or to several cubes.
     """
     shapes = {name: np.shape(gases.value(name)) for name in gases.domains}
     for name, shape in shapes.items():
@@ -270,7 +271,7 @@ def _swept_names(gases: Gas) -> list[str]:
     if sides == (gases.dimension,) and len(swept) < len(shapes):
         raise ValueError(
             f"{WALL_SIDE} of shape {sides} is ambiguous: the sides of one box or those of "
-            f"{sides[0]} cubes. Give every float of gases an axis of members, as jax.vmap does."
+            f"{sides[0]} cubes. Give every parameter of gases an axis of members, as jax.vmap does."
         )
     return [*swept, WALL_SIDE]
 
@@ -280,7 +281,7 @@ def _rows(tree: Any, rows: Any) -> Any:
 
 
 def _member(gases: Gas, i: int) -> Gas:
-    """Return one gas; raise ValueError for a float outside its range, which vmap lets pass."""
+    """Return one gas; raise ValueError for a parameter outside its range, which vmap lets pass."""
     gas = _rows(gases, i)
     return gas.replace(**{name: gas.value(name) for name in gas.domains})
 
@@ -381,7 +382,7 @@ def _identity(chunk: int, parts: dict[str, Any]) -> dict[str, Any]:
 def _labels(gases: Gas, swept: list[str], times: np.ndarray) -> dict[str, tuple]:
     """Return dimensions, values and attributes of the labels of a store, by name.
 
-    A swept float that has the name of a quantity of a curve gets the prefix initial_.
+    A swept parameter that has the name of a quantity of a curve gets the prefix initial_.
     """
     number = len(jax.tree.leaves(gases)[0])
     labels = {MEMBER: (MEMBER, np.arange(number)), TIME: (TIME, times, {"units": "s"})}
@@ -392,7 +393,7 @@ def _labels(gases: Gas, swept: list[str], times: np.ndarray) -> dict[str, tuple]
         if np.all(values == values[:1]):
             dims = dims[1:]
             values = values[0]
-        labels[label] = dims, values, {"units": FLOAT_UNITS.get(name, "1")}
+        labels[label] = dims, values, {"units": PARAMETER_UNITS.get(name, "1")}
     return labels
 
 

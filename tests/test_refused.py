@@ -384,7 +384,7 @@ FITS = [
     ({"free": (T_0, T_0)}, "different names"),
     (
         {"free": "law", "measurement": measured(gas=FIXED)},
-        'free="law", but the law Fixed has no floats',
+        'free="law", but the law Fixed has no parameters',
     ),
     ({"solver": "simplex"}, "solver must be a gradient transformation of optax"),
     (HAFF | {"measurement": measured(gas=GRAINS), "solver": optax.lbfgs()}, "line search"),

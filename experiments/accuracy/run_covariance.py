@@ -222,8 +222,8 @@ def row_of(scene: Scene, name: str, kind: str, runs: Runs) -> dict[str, Any]:
     return row
 
 
-def floats_of(gas: jaxgran.Gas) -> dict[str, list]:
-    return {name: np.asarray(x).tolist() for name, x in gas.floats.items()}
+def parameters_of(gas: jaxgran.Gas) -> dict[str, list]:
+    return {name: np.asarray(x).tolist() for name, x in gas.parameters.items()}
 
 
 def store(statistics: dict[str, dict[str, Any]]) -> None:
@@ -243,9 +243,9 @@ def statistics_of(scene: Scene, times: np.ndarray, runs: Runs) -> dict[str, Any]
     joint = runs.joint
     covariance = np.cov(joint, rowvar=False)
     lower = covariance[np.tril_indices(len(covariance))].astype(np.float32)
-    floats = json.dumps(floats_of(scene.make()))
+    parameters = json.dumps(parameters_of(scene.make()))
     mean = joint.mean(axis=0).astype(np.float32)
-    values = floats, scene.num_particles, len(joint), times, mean, lower
+    values = parameters, scene.num_particles, len(joint), times, mean, lower
     return dict(zip(FIELDS, values, strict=True))
 
 

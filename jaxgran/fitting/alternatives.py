@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.goodness import SIGNIFICANCE, goodness
-from jaxgran.fitting.parameters import as_floats, with_floats
+from jaxgran.fitting.parameters import as_floats, with_parameters
 from jaxgran.fitting.prediction import FLOOR, WHITE
 from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.rows import CurveRows
@@ -500,7 +500,7 @@ def constant_restitution(problem: Problem, trial: Trial) -> float:
     m = problem.curves[0]
     values = problem.values(trial.flat)[m.label]
     known = {name: x for name, x in values.items() if name in m.gas.domains}
-    gas = with_floats(m.gas, as_floats(known | {"exponent": 0.0}))
+    gas = with_parameters(m.gas, as_floats(known | {"exponent": 0.0}))
     return float(gas.restitution(VARIANT_SPEED))
 
 

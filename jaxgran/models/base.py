@@ -203,10 +203,10 @@ class AbstractModel(eqx.Module):
         """
 
     def check_fit(self, names: tuple[str, ...]) -> None:
-        """Check that the named floats of a gas can be fitted through this model (default: all).
+        """Check that the named parameters of a gas can be fitted through this model (default: all).
 
         Raises:
-            ValueError: naming the floats that cannot be fitted, with the reason.
+            ValueError: naming the parameters that cannot be fitted, with the reason.
         """
 
     def rotation_accuracy(self, gas: Gas) -> float:

@@ -46,7 +46,7 @@ def cool(
     in both, but for rounding, which the ten collisions of its equilibration enlarge.
 
     Args:
-        gas: the scene; its floats may be traced, differentiated and batched with `jax.vmap`.
+        gas: the scene; its parameters may be traced, differentiated and batched with `jax.vmap`.
         times: t, s, increasing and >= 0, shape (times,); need not start at 0.
         model: a `jaxgran.extend.AbstractModel`, by default `jaxgran.KineticTheory()`. "auto" uses
             the cheapest model whose estimated error is small enough; `jaxgran.choose_model` returns

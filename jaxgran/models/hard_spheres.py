@@ -74,7 +74,7 @@ class HardSpheres(AbstractSpheres):
             need two more runs for each number of the law and have noise, but no bias in a gas that
             clusters. None for projected derivatives.
 
-    Derivatives of T, T_rot and collisions are known in every float of the gas and in the times,
+    Derivatives of T, T_rot and collisions are known in every parameter of the gas and in the times,
     forward and reverse, for any law; of smooth spheres also those of the dissipated energy. The gas
     is assumed to remember its energies only, of translation and of rotation, whose tangents grow by
     what each impact, walls, drag and a drive exchange (`jaxgran.gradients.tangents`). Compared with

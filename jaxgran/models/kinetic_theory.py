@@ -94,7 +94,7 @@ class KineticTheory(AbstractModel):
     1 : 1.2 and 1 : 1.4 and of diameters within 10 % is right within .6 %
     (``experiments/accuracy/size_statistics.py``).
 
-    The curve is differentiable in every float of the gas and in the times, forward and reverse.
+    The curve is differentiable in every parameter of the gas and in the times, forward and reverse.
     Second derivatives must be forward over forward or forward over reverse, as in `jax.hessian`,
     not ``jax.jacrev(jax.jacrev(...))``.
 

@@ -106,7 +106,7 @@ def linearise(
     """
     size = times.size
     padded = pad_to(times, grid_size(size))
-    sizes = {name: np.size(x) for name, x in gas.floats.items() if name in names}
+    sizes = {name: np.size(x) for name, x in gas.parameters.items() if name in names}
     directions, delay = _directions(gas, sizes)
     program = _compiled(jax.default_backend())
     computed = program(model, gas, padded, np.asarray(tolerance), directions, delay)
@@ -131,7 +131,7 @@ def _directions(gas: Gas, sizes: dict[str, int]) -> tuple[Gas, np.ndarray]:
     """
     count = max(4, 1 << sum(sizes.values()).bit_length())
     along = jax.tree.map(lambda x: np.zeros((count, *x.shape), x.dtype), gas)
-    fields = gas._float_fields
+    fields = gas._parameter_fields
     begin = 1
     for name, size in sizes.items():
         numbers = fields[name].get(along).reshape(count, size)

@@ -241,7 +241,7 @@ TWO_LENGTHS = GAS.replace(temperature=jnp.ones(3), diameter=jnp.ones(2))
         ({"store": 3}, "store must be a path, got 3"),
         ({"key": 3}, "key must be a key .* or an array of keys"),
         ({"gases": {"dissipation": A}}, "got a dict. Build it by jax.vmap"),
-        ({"gases": GAS}, "no float of gases has a leading axis"),
+        ({"gases": GAS}, "no parameter of gases has a leading axis"),
         ({"gases": jax.tree.map(lambda x: x[:0], GASES)}, "one length, at least 1, got .* 0"),
         ({"gases": TWO_LENGTHS}, "one length, at least 1, got .*diameter 2.* temperature 3"),
         ({"key": jax.random.split(jax.random.key(0))}, "key 2, .*dissipative_constant 5"),

@@ -66,9 +66,9 @@ def test_stored_runs_scatter_as_theory_says(name):
     scene = runs.ALL[scene_name]
     stored = {field: STORED[f"{name}/{field}"] for field in runs.FIELDS}
     gas = scene.make()
-    floats = json.loads(str(stored["gas"]))
-    for float_name, value in runs.floats_of(gas).items():  # the runs are of this scene
-        np.testing.assert_allclose(value, floats[float_name], rtol=1e-12)
+    parameters = json.loads(str(stored["gas"]))
+    for key, value in runs.parameters_of(gas).items():  # the runs are of this scene
+        np.testing.assert_allclose(value, parameters[key], rtol=1e-12)
     n, num_runs = len(stored["mean"]), int(stored["runs"])
     lower = np.zeros((n, n))
     lower[np.tril_indices(n)] = stored["covariance"]
