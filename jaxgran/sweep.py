@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from functools import cache, partial
 from importlib.metadata import version
+from itertools import count
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +23,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental import multihost_utils
+from jax._src import distributed
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, ArrayLike, Float, Key, PRNGKeyArray
 from tqdm import tqdm
@@ -45,7 +46,14 @@ from jaxgran.scene.parameters import PARAMETER_UNITS
 DEFAULT_CHUNK = {False: 1024, True: 16}
 """Members per chunk, by whether the model is stochastic."""
 
-DEVICE, MEMBER = "device", "member"
+MAX_WAIT = 366 * 24 * 3600 * 1000
+"""Time, ms, that a process that has finished its chunks waits for the others: a year."""
+
+_BARRIERS = count()
+"""Numbers of barriers: all processes pass the same ones."""
+
+DEVICE = "device"
+MEMBER = "member"
 
 SPARE_FACTORS = (2.0, 4.0, 8.0)
 """Ratios of capacity to expected need, tried in turn: a chunk in which a member overflows its
@@ -194,7 +202,7 @@ def sweep(
             values[unsupported] = _empty(name, values.dtype)
             arrays[name][rows] = values
         arrays[STATUS][rows] = faults  # last: the chunk is complete now
-    _wait_for_all("jaxgran sweep: all chunks are finished")
+    _wait_for_all("all chunks are finished")
     known = {name: jnp.asarray(arrays[name][:]) for name in _records(like)}
     return jax.vmap(lambda known: curves.from_arrays({"times": times} | known, like))(known)
 
@@ -428,7 +436,7 @@ def _open_store(
             os.rename(temporary, path)  # complete, or not there
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
-    _wait_for_all("jaxgran sweep: the store is there")
+    _wait_for_all("the store is there")
     stored = _stored_identity(path) or {}
     differ = [name for name in identity if stored.get(name) != identity[name]]
     if differ:
@@ -440,9 +448,15 @@ def _open_store(
 
 
 def _wait_for_all(event: str) -> None:
-    """Wait until all processes are here; JAX ends this process if another one dies."""
+    """Wait until all processes are here; JAX ends this process if another one dies.
+
+    This is the barrier of the processes. That of the devices
+    (`jax.experimental.multihost_utils.sync_global_devices`) fails after half an hour on CPUs.
+    """
     if jax.process_count() > 1:
-        multihost_utils.sync_global_devices(event)
+        assert distributed.global_state.client is not None
+        name = f"jaxgran.sweep {next(_BARRIERS)}: {event}"
+        distributed.global_state.client.wait_at_barrier(name, MAX_WAIT)
 
 
 def _stored_identity(path: Path) -> dict[str, Any] | None:
