@@ -279,8 +279,8 @@ def compare_alternatives(
         # Such a curve prefers whatever has less noise.
         significant = np.inf
     summary = _Summary(problem, bases[0], best, significant, noise)
-    law = summary.of(None, [[base] for base in bases])
-    alternatives = [summary.of(kind, found, law) for kind, found in profiles.items()]
+    law = summary.build(None, [[base] for base in bases])
+    alternatives = [summary.build(kind, found, law) for kind, found in profiles.items()]
     best_first = sorted(alternatives, key=lambda alternative: -alternative.improvement)
     return Explanations(law, tuple(best_first))
 
@@ -294,7 +294,7 @@ class _Summary(NamedTuple):
     significant: float
     noise: Float[np.ndarray, "p"]
 
-    def of(
+    def build(
         self, kind: Kind | None, profiles: list[list[Trial]], law: Alternative | None = None
     ) -> Alternative:
         """Return an alternative from its trials, interpolated between the amplitudes."""

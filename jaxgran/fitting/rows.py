@@ -16,7 +16,7 @@ from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import Measurement
 from jaxgran.fitting.parameters import with_parameters
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.choose import error_model_along
+from jaxgran.models.choose import error_model_of_curve
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.linearise import (
     curve_of_program,
@@ -497,7 +497,7 @@ def with_rate_error(rows: CurveRows, model: AbstractModel, gas: Gas) -> CurveRow
     curve = curve_of_program(exact, gas, times, rows.displacement is not None)
     if not np.all(np.isfinite(np.asarray(curve.temperature))):
         return rows
-    error_model = error_model_along(gas, curve, rows.measurement.num_particles)
+    error_model = error_model_of_curve(gas, curve, rows.measurement.num_particles)
     error = np.broadcast_to(model.rate_error(error_model), times.shape)
     return replace(rows, rate_error=(times, np.asarray(error, float)))
 

@@ -58,7 +58,7 @@ from jaxgran.fitting.setup import (
     with_values_of,
 )
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.choose import error_model_along
+from jaxgran.models.choose import error_model_of_curve
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.linearise import linearise, with_neutral_elements
 from jaxgran.scene.gas import Gas
@@ -568,7 +568,7 @@ def derivative_bias(sims: Simulations, search: Search, gas: Gas, sensitivity: np
     bias = curve.derivative_bias
     if bias is None:
         N = getattr(sims.model, "num_particles", None)
-        error_model = error_model_along(gas, _from_start(gas, curve), N)
+        error_model = error_model_of_curve(gas, _from_start(gas, curve), N)
         whole = np.broadcast_to(sims.model.derivative_error(error_model), error_model.time.shape)
         bias = whole[-curve.times.size :]
     weights = np.sum(sensitivity[: curve.times.size] ** 2, axis=1)

@@ -191,7 +191,7 @@ def error_model_of(gas: Gas, end: float, num_particles: int | None = None) -> Er
     grid = np.linspace(0, np.log1p(end / mean_free_time), NUM_TIMES)
     known = dataclasses.replace(gas, surface=None) if "friction" in gas.elements else gas
     curve = curve_of_program(KineticTheory(), known, np.expm1(grid) * mean_free_time)
-    error_model = error_model_along(gas, curve, num_particles)
+    error_model = error_model_of_curve(gas, curve, num_particles)
     softest = int(np.argmax(error_model.softness))
     hottest = np.exp(error_model.log_temperature[softest] / 2)
     check_softness(gas, 1 - error_model.softness[softest], hottest)
@@ -201,7 +201,7 @@ def error_model_of(gas: Gas, end: float, num_particles: int | None = None) -> Er
     return error_model
 
 
-def error_model_along(
+def error_model_of_curve(
     gas: Gas, curve: CoolingCurve, num_particles: int | None = None
 ) -> ErrorModel:
     """Build the error model of a gas from its cooling curve, which begins at t = 0.

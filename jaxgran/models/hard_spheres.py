@@ -196,17 +196,17 @@ class HardSpheres(AbstractSpheres):
         N = 125 to 50 000."""
         d = dimension
         n = replicas * self.num_particles
-        around = self.neighbourhood(scene, d, replicas)
+        neighbours = self.neighbourhood(scene, d, replicas)
         share = max(WINDOW_SHARE, 2 * MIN_IMPACTS / n)
         fastest = SPEED_MARGIN * (0.5 + (2 * math.log(n)) ** 0.5)  # of Maxwell's n speeds
         longest = share if share == WINDOW_SHARE else SKIN_GROWTH * share
-        reach = 2 * fastest * longest / around.collision_frequency
-        packed = 0.9 + 0.45 * around.in_contact / 2 ** (d - 1)
-        near = packed * around.contact_value * around.in_contact * ((1 + reach) ** d - 1)
-        near = min(near, around.listed)
-        chosen = min((0.65 + 0.35 * near) * longest, around.listed)
-        expected = around.listed, near, chosen, 1.25 * longest
-        extra = 1.3 * max(around.in_contact - 0.4, 0.0)  # random positions have more near pairs
-        capacity, crowded = capacities(expected, around.lookahead, spare or 1.15, extra, n)
+        reach = 2 * fastest * longest / neighbours.collision_frequency
+        packed = 0.9 + 0.45 * neighbours.in_contact / 2 ** (d - 1)
+        near = packed * neighbours.contact_value * neighbours.in_contact * ((1 + reach) ** d - 1)
+        near = min(near, neighbours.listed)
+        chosen = min((0.65 + 0.35 * near) * longest, neighbours.listed)
+        expected = neighbours.listed, near, chosen, 1.25 * longest
+        extra = 1.3 * max(neighbours.in_contact - 0.4, 0.0)  # random positions have more near pairs
+        capacity, crowded = capacities(expected, neighbours.lookahead, spare or 1.15, extra, n)
         made_for = ("num_particles", self.num_particles), ("replicas", self.replicas)
         return ArraySizes(made_for, share, capacity, crowded)

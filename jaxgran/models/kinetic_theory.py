@@ -372,37 +372,46 @@ class KineticTheory(AbstractModel):
         state, fault = self._solver(gas, times, tolerance).moments(scene, reduced)
         return self._curve(gas, times, state, fault)
 
-    def solve_along(
-        self, gas: Gas, times: Float[Array, "times"], tolerance: Any, gas_along: Gas, delay: Any
+    def solve_with_tangents(
+        self,
+        gas: Gas,
+        times: Float[Array, "times"],
+        tolerance: Any,
+        gas_tangents: Gas,
+        shift_tangents: Any,
     ) -> tuple[CoolingCurve, CoolingCurve]:
         """Return `solve`, and its derivatives along some directions of the gas and of the times.
 
         Args:
             gas, times, tolerance: as of `solve`.
-            gas_along: tangents of the gas, with a first axis (directions,).
-            delay: tangents of a shift of all times, shape (directions,).
+            gas_tangents: tangents of the gas, with a first axis (directions,).
+            shift_tangents: tangents of a shift of all times, shape (directions,).
         """
-        times_along = jnp.broadcast_to(delay[:, None], (*delay.shape, times.size))
+        times_tangents = jnp.broadcast_to(
+            shift_tangents[:, None], (*shift_tangents.shape, times.size)
+        )
 
         def each(function, *primals):
             """Return values, and derivatives along each direction."""
 
-            def along(*tangents):
+            def with_tangents(*tangents):
                 return jax.jvp(function, primals, tangents)
 
-            return jax.vmap(along, out_axes=(None, 0))
+            return jax.vmap(with_tangents, out_axes=(None, 0))
 
-        reduced = each(self._reduced, gas, times)(gas_along, times_along)
-        (scene, at), (scene_along, at_along) = reduced
+        reduced = each(self._reduced, gas, times)(gas_tangents, times_tangents)
+        (scene, at), (scene_tangents, at_tangents) = reduced
         solver = self._solver(gas, times, tolerance)
-        state, state_along, fault = solver.moments_along(scene, at, scene_along, at_along)
+        state, state_tangents, fault = solver.moments_along(scene, at, scene_tangents, at_tangents)
 
         def curve(gas, times, state):
             return dataclasses.replace(self._curve(gas, times, state, fault), status=None)
 
-        computed, along = each(curve, gas, times, state)(gas_along, times_along, state_along)
+        computed, tangents = each(curve, gas, times, state)(
+            gas_tangents, times_tangents, state_tangents
+        )
         whole = self._curve(gas, times, state, fault)
-        return dataclasses.replace(computed, status=whole.status), along
+        return dataclasses.replace(computed, status=whole.status), tangents
 
     def _reduced(
         self, gas: Gas, times: Float[Array, "times"]

@@ -85,7 +85,7 @@ def with_variant_law(gas: Gas) -> Gas:
     """Return a gas whose viscoelastic law has the floats of alternative laws, without effect."""
     if type(gas.law) is not Viscoelastic:
         return gas
-    return dataclasses.replace(gas, law=ViscoelasticVariant.of(gas.law))
+    return dataclasses.replace(gas, law=ViscoelasticVariant.from_law(gas.law))
 
 
 def linearise(
@@ -163,7 +163,7 @@ def _linearised(
     model: AbstractModel, gas: Gas, times: Array, tolerance: Array, gas_along: Gas, delay: Array
 ) -> tuple[dict[str, Array], dict[str, Array]]:
     """Values of a curve, and their derivatives along directions."""
-    curve, along = model.solve_along(gas, times, tolerance, gas_along, delay)
+    curve, along = model.solve_with_tangents(gas, times, tolerance, gas_along, delay)
     values = {name: getattr(curve, name) for name in COMPUTED}
     slopes = {name: getattr(along, name) for name in LINEARISED}
     return _known(values), _known(slopes)

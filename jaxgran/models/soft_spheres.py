@@ -257,7 +257,7 @@ class SoftSpheres(AbstractSpheres):
         t_c/tau_c = .003 to .3."""
         d = dimension
         n = replicas * self.num_particles
-        around = self.neighbourhood(scene, d, replicas)
+        neighbours = self.neighbourhood(scene, d, replicas)
         duration = round_up(float(scene.contact_duration), grid(n)[0])
         # A block lasts at most a contact, less if spheres fly far in that time.
         contacts_flown = MAX_SPEED * float(scene.contact_duration) / BLOCK_FLIGHT
@@ -265,16 +265,16 @@ class SoftSpheres(AbstractSpheres):
         steps = max(round(self.steps_per_contact / shorter), 8)
         block = steps / self.steps_per_contact
         flight = MAX_SPEED * duration * block
-        near = 0.75 * around.in_contact * around.contact_value * ((1 + 5 * flight) ** d - 1)
-        near = near * around.listed / (near + around.listed)
+        near = 0.75 * neighbours.in_contact * neighbours.contact_value * ((1 + 5 * flight) ** d - 1)
+        near = near * neighbours.listed / (near + neighbours.listed)
         # Contacts that exist or begin in a block, and the near pairs.
-        contact_fraction = duration * around.collision_frequency
+        contact_fraction = duration * neighbours.collision_frequency
         contact_fraction *= (1 + block) / 2
         touching = min(contact_fraction * (2.2 + 3 * near**2), near)
-        expected = around.listed, near, touching, 2 * touching / (1 + 1.6 * touching**0.6)
+        expected = neighbours.listed, near, touching, 2 * touching / (1 + 1.6 * touching**0.6)
         # At random positions the additional touching pairs are about those without correlation.
-        extra = 1.3 * around.in_contact
-        capacity, crowded = capacities(expected, around.lookahead, spare or 1.2, extra, n)
+        extra = 1.3 * neighbours.in_contact
+        capacity, crowded = capacities(expected, neighbours.lookahead, spare or 1.2, extra, n)
         names = "num_particles", "replicas", "steps_per_contact"
         made_for = tuple((name, getattr(self, name)) for name in names)
         return ArraySizes(made_for, steps, capacity, crowded)

@@ -97,11 +97,11 @@ class AbstractSpheres(AbstractParticleModel):
         """Return the expected numbers of neighbours in a scene of known numbers."""
         side = float(scene.filled_side)
         n = self.num_particles
-        around = Neighbourhood.expected(side, n, replicas, dimension, self.listed_by_skin)
+        found = Neighbourhood.expected(side, n, replicas, dimension, self.listed_by_skin)
         if scene.container is None:
-            return around
+            return found
         shorter = max(1.0, side / float(scene.container[0]))  # the sweep runs along the first axis
-        return around._replace(lookahead=min(around.lookahead * shorter, n))
+        return found._replace(lookahead=min(found.lookahead * shorter, n))
 
     def derivative_error(self, error_model: ErrorModel) -> Float[np.ndarray, "times"]:
         """Relative error of projected derivatives by a flow, or of differences by their noise."""

@@ -502,7 +502,7 @@ class ViscoelasticVariant(Viscoelastic):
     }
 
     @classmethod
-    def of(cls, law: Viscoelastic) -> "ViscoelasticVariant":
+    def from_law(cls, law: Viscoelastic) -> "ViscoelasticVariant":
         """Return a variant that is a given law."""
         return cls(**{f.name: getattr(law, f.name) for f in dataclasses.fields(Viscoelastic)})
 

@@ -202,7 +202,7 @@ def test_a_constant_restitution_is_named_and_A_has_no_meaning_then():
 
 def test_eps_that_scatters_is_an_alternative():
     gas = glass_beads(0.1)
-    variant = dataclasses.replace(ViscoelasticVariant.of(gas.law), spread=0.15)
+    variant = dataclasses.replace(ViscoelasticVariant.from_law(gas.law), spread=0.15)
     curve = exact_to(dataclasses.replace(gas, law=variant), 0)
     result = without_chance(gas, curve)
     found = next(a for a in result.alternatives if a.name.startswith("eps that scatters"))

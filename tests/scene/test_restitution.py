@@ -110,7 +110,7 @@ def test_restitution_is_a_fraction_that_falls(clipped):
 def test_a_variant_is_the_viscoelastic_law_or_one_whose_eps_scatters():
     gas = glass_beads(0.3)
     speeds = jnp.array([0.02, 0.5, 2.0])
-    same = dataclasses.replace(gas, law=ViscoelasticVariant.of(gas.law))
+    same = dataclasses.replace(gas, law=ViscoelasticVariant.from_law(gas.law))
     powers = same.reduced_law.loss_powers(speeds, 6)
     np.testing.assert_allclose(powers, gas.reduced_law.loss_powers(speeds, 6), rtol=1e-12)
     constant = same.replace(exponent=0.0).restitution(np.array([0.01, 1.0]))
