@@ -17,11 +17,10 @@ The examples in the docstrings use these definitions:
 from importlib import import_module
 from typing import Any
 
-from jaxgran._utils.status import explain as explain_status  # noqa: F401
-from jaxgran._utils.validation import Domain as Domain
+from jaxgran import extend as extend
+from jaxgran._utils.status import explain as explain_status
 from jaxgran.data.curve import CoolingCurve as CoolingCurve
 from jaxgran.data.curve import Particles as Particles
-from jaxgran.data.curve import Run as Run
 from jaxgran.data.curve_file import read_curve as read_curve
 from jaxgran.data.curve_file import write_curve as write_curve
 from jaxgran.data.drop_test import DropTest as DropTest
@@ -43,13 +42,10 @@ from jaxgran.fitting.plan import Expected as Expected
 from jaxgran.fitting.plan import Plan as Plan
 from jaxgran.fitting.plan import plan as plan
 from jaxgran.fitting.result import Fit as Fit
-from jaxgran.models.base import AbstractModel as AbstractModel
-from jaxgran.models.base import Limitation as Limitation
 from jaxgran.models.choose import Choice as Choice
 from jaxgran.models.choose import choose_model as choose_model
 from jaxgran.models.cool import cool as cool
 from jaxgran.models.dsmc import DSMC as DSMC
-from jaxgran.models.error_model import ErrorModel as ErrorModel
 from jaxgran.models.hard_spheres import HardSpheres as HardSpheres
 from jaxgran.models.kinetic_theory import KineticTheory as KineticTheory
 from jaxgran.models.soft_spheres import SoftSpheres as SoftSpheres
@@ -66,8 +62,6 @@ from jaxgran.scene.elements import WhiteNoise as WhiteNoise
 from jaxgran.scene.gas import Gas as Gas
 from jaxgran.scene.geometry import sphere_mass as sphere_mass
 from jaxgran.scene.laws import ConstantRestitution as ConstantRestitution
-from jaxgran.scene.laws import ReducedLaw as ReducedLaw
-from jaxgran.scene.laws import RestitutionLaw as RestitutionLaw
 from jaxgran.scene.laws import RestitutionSeries as RestitutionSeries
 from jaxgran.scene.laws import RestitutionSpline as RestitutionSpline
 from jaxgran.scene.laws import Viscoelastic as Viscoelastic
@@ -76,8 +70,59 @@ from jaxgran.sweep import sweep as sweep
 from jaxgran.theory.equations import SteadyState as SteadyState
 from jaxgran.theory.equations import steady_state as steady_state
 
-__all__ = ["observables"] + [  # pyright: ignore[reportUnsupportedDunderAll]
-    name for name, x in globals().items() if getattr(x, "__module__", "").startswith("jaxgran.")
+__all__ = [
+    "Alternative",
+    "Choice",
+    "ConstantRestitution",
+    "CoolingCurve",
+    "DSMC",
+    "DropTest",
+    "Expected",
+    "Fit",
+    "Frictional",
+    "Gas",
+    "HardSpheres",
+    "Imitation",
+    "Impact",
+    "Impacts",
+    "KineticTheory",
+    "Measurement",
+    "Particles",
+    "Plan",
+    "RestitutionBand",
+    "RestitutionSeries",
+    "RestitutionSpline",
+    "Rough",
+    "SoftSpheres",
+    "SteadyState",
+    "StokesDrag",
+    "Viscoelastic",
+    "Walls",
+    "WhiteNoise",
+    "choose_model",
+    "contact_force",
+    "cool",
+    "elastic_constant",
+    "example_measurement",
+    "explain_status",
+    "extend",
+    "fit",
+    "imitate",
+    "impact",
+    "lammps_commands",
+    "log_likelihood",
+    "observables",
+    "plan",
+    "read_curve",
+    "read_impacts",
+    "read_measurement",
+    "read_particles",
+    "restitution_band",
+    "sphere_mass",
+    "steady_state",
+    "sweep",
+    "viscoelastic_restitution",
+    "write_curve",
 ]
 
 _PLOT_FUNCTIONS = ("plot_curve", "plot_fit", "plot_plan")

@@ -1,9 +1,9 @@
 """Sweeps: the cooling curves of many gases, over devices and processes, with an optional store.
 
-The members of a sweep are gases that share a structure and differ in floats and keys. Each process
-runs chunks of members in one compiled program on its devices. A store is a Zarr group, labelled for
-xarray, whose arrays are divided into the same chunks. The status of a chunk is written last: until
-then it is `MISSING`, and a sweep that is resumed computes the chunk.
+The members of a sweep are gases that share a structure and differ in parameters and keys. Each
+process runs chunks of members in one compiled program on its devices. A store is a Zarr group,
+labelled for xarray, whose arrays are divided into the same chunks. The status of a chunk is written
+last: until then it is `MISSING`, and a sweep that is resumed computes the chunk.
 """
 
 import dataclasses
@@ -11,11 +11,11 @@ import hashlib
 import json
 import os
 import shutil
-import time
 import warnings
 from collections.abc import Callable, Sequence
 from functools import cache, partial
 from importlib.metadata import version
+from itertools import count
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,6 +23,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax._src import distributed
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, ArrayLike, Float, Key, PRNGKeyArray
 from tqdm import tqdm
@@ -40,15 +41,19 @@ from jaxgran.models.spheres import AbstractSpheres
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.run import block_until_ready
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.parameters import FLOAT_UNITS
+from jaxgran.scene.parameters import PARAMETER_UNITS
 
 DEFAULT_CHUNK = {False: 1024, True: 16}
 """Members per chunk, by whether the model is stochastic."""
 
-POLL_SECONDS = 0.3
-"""Interval at which a process that has finished its chunks looks for those of the others."""
+MAX_WAIT = 366 * 24 * 3600 * 1000
+"""Time, ms, that a process that has finished its chunks waits for the others: a year."""
 
-DEVICE, MEMBER = "device", "member"
+_BARRIERS = count()
+"""Numbers of barriers: all processes pass the same ones."""
+
+DEVICE = "device"
+MEMBER = "member"
 
 SPARE_FACTORS = (2.0, 4.0, 8.0)
 """Ratios of capacity to expected need, tried in turn: a chunk in which a member overflows its
@@ -61,7 +66,7 @@ ATTRIBUTE = "sweep"
 """Attribute of a store that identifies the sweep."""
 
 WALL_SIDE = "wall_side"
-"""The only float that may be one number or d numbers."""
+"""The only parameter that may be one number or d numbers."""
 
 
 def sweep(
@@ -81,7 +86,7 @@ def sweep(
     distributed over the processes of a `jax.distributed` job: process p computes the chunks c with
     c = p modulo the number of processes. Members are independent, so the processes share nothing
     but the store. When a process has finished its own chunks, it waits for all others and returns
-    the complete result. If a process dies, JAX ends the others after
+    the complete result. If a process dies, JAX ends the others, at the latest after
     ``heartbeat_timeout_seconds`` of `jax.distributed.initialize`. The same call then computes the
     missing chunks, with any number of processes.
 
@@ -89,12 +94,13 @@ def sweep(
     Members that the model does not support are reported in a warning.
 
     Args:
-        gases: a gas in which some or all floats have a leading axis of members, as returned by
+        gases: a gas in which some or all parameters have a leading axis of members, as returned by
             ``jax.vmap(lambda a: gas.replace(dissipative_constant=a))(values)``. A list of floats
             (coefficients of a series, sides of a box) has the axis of members first.
         times: t, s, increasing and >= 0, shape (times,).
-        model: a `jaxgran.AbstractModel`, by default `jaxgran.KineticTheory()`. Arrays of particle
-            models are sized for the member with the largest need, unless `sized_for` was called.
+        model: a `jaxgran.extend.AbstractModel`, by default `jaxgran.KineticTheory()`. Arrays of
+            particle models are sized for the member with the largest need, unless `sized_for` was
+            called.
         key: the random key, from which `jax.random.fold_in` derives one key for each member; or an
             array with one key for each member. By default `jax.random.key(0)`. The key of a member
             does not depend on the number of members.
@@ -103,10 +109,11 @@ def sweep(
             ``curves.saved``, ``curves.saved_error`` and ``curves.replicas.saved``. Integers and
             booleans of an unsupported member are 0.
         store: path of a Zarr group that `xarray.open_zarr` reads: arrays have the names of
-            `CoolingCurve.to_xarray` and a first dimension member, and swept floats and units are
-            labels. Each chunk is written when it ends; until then its status is -1. If the group is
-            the store of the same sweep, only missing chunks are computed. Needs the extra `sweep`,
-            and a file system that all processes share. None keeps the results in memory only.
+            `CoolingCurve.to_xarray` and a first dimension member, and swept parameters and units
+            are labels. Each chunk is written when it ends; until then its status is -1. If the
+            group is the store of the same sweep, only missing chunks are computed. Needs the extra
+            `sweep`, and a file system that all processes share. None keeps the results in memory
+            only.
         chunk: number of members computed and written together, >= 1; by default that of an existing
             store, otherwise 16 for a stochastic model and 1024 for others.
         progress: show a progress bar on a terminal.
@@ -116,11 +123,11 @@ def sweep(
         shape (members, times). Without particles.
 
     Raises:
-        ValueError: if the leading axes of the floats have different lengths, if floats of all
-            members are outside their range, if the model supports no member, for several processes
-            without a store, if `save` is not a function of particles or returns values without
-            names, or if the store belongs to another sweep or another version of jaxgran. Nothing
-            is overwritten.
+        ValueError: if the leading axes of the parameters have different lengths, if parameters of
+            all members are outside their range, if the model supports no member, for several
+            processes without a store, if `save` is not a function of particles or returns values
+            without names, or if the store belongs to another sweep or another version of jaxgran.
+            Nothing is overwritten.
         OSError: if the store cannot be written.
 
     >>> gases = jax.vmap(lambda a: gas.replace(dissipative_constant=a))(jnp.array([1e-6, 3e-6]))
@@ -128,7 +135,8 @@ def sweep(
     (2, 4)
     """
     check_bool(progress=progress)
-    times, (gases, keys, swept) = checked_times(times), _checked_members(gases, key)
+    times = checked_times(times)
+    gases, keys, swept = _checked_members(gases, key)
     model = checks.checked_model(KineticTheory() if model is None else model)
     model.check_save(save)
     if not isinstance(store, str | os.PathLike | None):
@@ -137,10 +145,12 @@ def sweep(
         raise ValueError(
             f"a sweep over {jax.process_count()} processes needs store, a folder that all share"
         )
-    number, path = len(keys), None if store is None else Path(store)
+    number = len(keys)
+    path = None if store is None else Path(store)
+    stored = None if path is None else _stored_identity(path)
     if chunk is not None:
         chunk = min(checked_int("chunk", chunk, 1), number)
-    elif path is not None and (stored := _stored_identity(path)):
+    elif stored is not None:
         chunk = int(stored["chunk"])
     else:
         chunk = min(DEFAULT_CHUNK[model.stochastic], -(-number // jax.process_count()))
@@ -153,14 +163,14 @@ def sweep(
             return str(error)
         return None
 
-    supported = (i for i in range(number) if why_unsupported(i) is None)
-    if (stand_in := next(supported, None)) is None:
+    stand_in = next((i for i in range(number) if why_unsupported(i) is None), None)
+    if stand_in is None:
         name = type(model).__name__
         raise ValueError(f"{name} supports no member of this sweep; member 0: {why_unsupported(0)}")
     models = [model]
-    if isinstance(model, AbstractSpheres) and model.plan is None:
-        sized_for = [_member(gases, i) for i in (stand_in, *supported)]
-        models = [_sized_for_all(model, sized_for, spare) for spare in SPARE_FACTORS]
+    if isinstance(model, AbstractSpheres) and model._sizes is None:
+        supported = [_member(gases, i) for i in range(number) if why_unsupported(i) is None]
+        models = [_sized_for_all(model, supported, spare) for spare in SPARE_FACTORS]
     run_member = partial(_run_member, model=models[0], times=times, save=save)
     like = jax.eval_shape(run_member, *_rows((gases, keys), stand_in))
     arrays: Any = {
@@ -186,19 +196,19 @@ def sweep(
             )
         chosen = _rows((gases, keys), np.where(unsupported, stand_in, members))
         computed = _run_chunk(models, chosen, times, chunk, save)
-        computed[STATUS][unsupported] = status.UNSUPPORTED.bit
-        for name in sorted(computed, key=STATUS.__eq__):  # the status last
-            if name != STATUS:
-                computed[name][unsupported] = _empty(name, computed[name].dtype)
-            arrays[name][rows] = computed[name]
-    while np.any(arrays[STATUS][:] == MISSING):  # JAX ends this process if another one dies
-        time.sleep(POLL_SECONDS)
+        faults = computed.pop(STATUS)
+        faults[unsupported] = status.UNSUPPORTED.bit
+        for name, values in computed.items():
+            values[unsupported] = _empty(name, values.dtype)
+            arrays[name][rows] = values
+        arrays[STATUS][rows] = faults  # last: the chunk is complete now
+    _wait_for_all("all chunks are finished")
     known = {name: jnp.asarray(arrays[name][:]) for name in _records(like)}
     return jax.vmap(lambda known: curves.from_arrays({"times": times} | known, like))(known)
 
 
 def _checked_members(gases: Any, key: Any) -> tuple[Gas, Key[Array, "members"], list[str]]:
-    """Return gases and keys with an axis of members, and the names of floats that were given one.
+    """Return gases and keys with an axis of members, and the names of the swept parameters.
 
     Raises:
         ValueError: for anything but a gas, for leading axes of different lengths, and if nothing
@@ -223,15 +233,15 @@ def _checked_members(gases: Any, key: Any) -> tuple[Gas, Key[Array, "members"], 
     lengths |= {name: len(gases.value(name)) for name in swept}
     if not lengths:
         raise ValueError(
-            f"no float of gases has a leading axis, and there is only one key. Build gases by {how}"
-            ", give an array of keys, or use jaxgran.cool for one gas."
+            "no parameter of gases has a leading axis, and there is only one key. Build gases by "
+            f"{how}, give an array of keys, or use jaxgran.cool for one gas."
         )
     number = next(iter(lengths.values()))
     if set(lengths.values()) != {number} or number == 0:
         listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
         raise ValueError(
             f"the leading axes of a sweep must have one length, at least 1, got {listed}. Give "
-            "every swept float one value for each member."
+            "every swept parameter one value for each member."
         )
     if keys.ndim == 0:
         keys = jax.vmap(partial(jax.random.fold_in, keys))(jnp.arange(number))
@@ -248,11 +258,11 @@ def _checked_members(gases: Any, key: Any) -> tuple[Gas, Key[Array, "members"], 
 
 
 def _swept_names(gases: Gas) -> list[str]:
-    """Return the names of the floats that have an axis of members.
+    """Return the names of the parameters that have an axis of members.
 
     Raises:
-        ValueError: for floats with further axes, and for wall sides that may belong to one box or
-            to several cubes.
+        ValueError: for parameters with further axes, and for wall sides that may belong to one box
+            or to several cubes.
     """
     shapes = {name: np.shape(gases.value(name)) for name in gases.domains}
     for name, shape in shapes.items():
@@ -269,7 +279,7 @@ def _swept_names(gases: Gas) -> list[str]:
     if sides == (gases.dimension,) and len(swept) < len(shapes):
         raise ValueError(
             f"{WALL_SIDE} of shape {sides} is ambiguous: the sides of one box or those of "
-            f"{sides[0]} cubes. Give every float of gases an axis of members, as jax.vmap does."
+            f"{sides[0]} cubes. Give every parameter of gases an axis of members, as jax.vmap does."
         )
     return [*swept, WALL_SIDE]
 
@@ -279,7 +289,7 @@ def _rows(tree: Any, rows: Any) -> Any:
 
 
 def _member(gases: Gas, i: int) -> Gas:
-    """Return one gas; raise ValueError for a float outside its range, which vmap lets pass."""
+    """Return one gas; raise ValueError for a parameter outside its range, which vmap lets pass."""
     gas = _rows(gases, i)
     return gas.replace(**{name: gas.value(name) for name in gas.domains})
 
@@ -293,16 +303,21 @@ def _empty(name: str, dtype: Any) -> Any:
 
 def _sized_for_all(model: AbstractSpheres, gases: Sequence[Gas], spare: float) -> AbstractSpheres:
     """Return a model with arrays long enough, and blocks of steps short enough, for all gases."""
-    plans = [plan for gas in gases if (plan := model.sized_for(gas, spare).plan) is not None]
-    if len({plan.engine for plan in plans}) > 1:  # look-aheads of two searches, for one array
+    sized = [model.sized_for(gas, spare) for gas in gases]
+    needs = [model._sizes for model in sized if model._sizes is not None]
+    if len({need.engine for need in needs}) > 1:  # look-aheads of two searches, for one array
         return _sized_for_all(dataclasses.replace(model, neighbours="cells"), gases, spare)
-    steps = min(plan.steps for plan in plans)
-    run, equilibration = (
-        Capacity(*map(max, zip(*capacities, strict=True)))
-        for capacities in zip(*((p.capacity, p.equilibration_capacity) for p in plans), strict=True)
+    sizes = needs[0]._replace(
+        steps=min(need.steps for need in needs),
+        capacity=_largest([need.capacity for need in needs]),
+        equilibration_capacity=_largest([need.equilibration_capacity for need in needs]),
     )
-    plan = plans[0]._replace(steps=steps, capacity=run, equilibration_capacity=equilibration)
-    return dataclasses.replace(model, plan=plan)
+    return dataclasses.replace(model, _sizes=sizes)
+
+
+def _largest(capacities: Sequence[Capacity]) -> Capacity:
+    """Return a capacity that is enough for all of some runs."""
+    return Capacity(*np.max(capacities, axis=0).tolist())
 
 
 def _run_member(gas: Gas, key: PRNGKeyArray, *, model, times, save) -> CoolingCurve:
@@ -329,7 +344,8 @@ def _run_chunk(
     The last member is repeated until every device has the same number. If members of a particle
     model overflow their arrays, the chunk is run again with the next model.
     """
-    number, mesh = len(members[1]), Mesh(np.array(jax.local_devices()[:chunk]), (DEVICE,))
+    number = len(members[1])
+    mesh = Mesh(np.array(jax.local_devices()[:chunk]), (DEVICE,))
     rows = np.minimum(np.arange(-(-chunk // mesh.size) * mesh.size), number - 1)
     arrays: dict[str, np.ndarray] = {}
     for model in models:
@@ -366,15 +382,17 @@ def _run_on_devices(model: AbstractModel, members: Any, times: Array, mesh: Mesh
 
 def _identity(chunk: int, parts: dict[str, Any]) -> dict[str, Any]:
     """Return what identifies a sweep: the chunk, the version, and a hash of each other part."""
-    descriptions = {name: json.dumps(describe_run(part=part)) for name, part in parts.items()}
-    hashes = {name: hashlib.sha256(x.encode()).hexdigest()[:16] for name, x in descriptions.items()}
-    return {"chunk": chunk, "version of jaxgran": version("jaxgran")} | hashes
+    identity = {"chunk": chunk, "version of jaxgran": version("jaxgran")}
+    for name, part in parts.items():
+        words = json.dumps(describe_run(part=part))
+        identity[name] = hashlib.sha256(words.encode()).hexdigest()[:16]
+    return identity
 
 
 def _labels(gases: Gas, swept: list[str], times: np.ndarray) -> dict[str, tuple]:
     """Return dimensions, values and attributes of the labels of a store, by name.
 
-    A swept float that has the name of a quantity of a curve gets the prefix initial_.
+    A swept parameter that has the name of a quantity of a curve gets the prefix initial_.
     """
     number = len(jax.tree.leaves(gases)[0])
     labels = {MEMBER: (MEMBER, np.arange(number)), TIME: (TIME, times, {"units": "s"})}
@@ -383,8 +401,9 @@ def _labels(gases: Gas, swept: list[str], times: np.ndarray) -> dict[str, tuple]
         label = f"initial_{name}" if name in curves.QUANTITIES else name
         dims = (MEMBER, *(f"{label}_{k}" for k in range(values.ndim - 1)))
         if np.all(values == values[:1]):
-            dims, values = dims[1:], values[0]
-        labels[label] = dims, values, {"units": FLOAT_UNITS.get(name, "1")}
+            dims = dims[1:]
+            values = values[0]
+        labels[label] = dims, values, {"units": PARAMETER_UNITS.get(name, "1")}
     return labels
 
 
@@ -396,12 +415,16 @@ def _open_store(
     are_particles: bool,
 ) -> Any:
     """Return the Zarr group of a sweep; create it, with all labels and no finished chunk."""
-    zarr, xarray = (curves.import_extra(name, "sweep") for name in ("zarr", "xarray"))
+    zarr = curves.import_extra("zarr", "sweep")
+    xarray = curves.import_extra("xarray", "sweep")
     if _stored_identity(path) is None and jax.process_index() == 0:
-        variables, encoding = {}, {}
+        variables = {}
+        encoding = {}
         for name, values in empty.items():
-            dims, attributes = (), {"long_name": "faults, see jaxgran.explain_status"}
-            if name != STATUS:
+            if name == STATUS:
+                dims = ()
+                attributes = {"long_name": "faults, see jaxgran.explain_status"}
+            else:
                 dims, attributes = curves.label_of(name, values.ndim - 1, are_particles)
             variables[name] = (MEMBER, *dims), values, attributes
             fill = _empty(name, values.dtype)
@@ -415,8 +438,8 @@ def _open_store(
             os.rename(temporary, path)  # complete, or not there
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
-    while (stored := _stored_identity(path)) is None:
-        time.sleep(POLL_SECONDS)
+    _wait_for_all("the store is there")
+    stored = _stored_identity(path) or {}
     differ = [name for name in identity if stored.get(name) != identity[name]]
     if differ:
         raise ValueError(
@@ -424,6 +447,18 @@ def _open_store(
             "store, or remove it to start again."
         )
     return zarr.open_group(path, mode="r+")
+
+
+def _wait_for_all(event: str) -> None:
+    """Wait until all processes are here; JAX ends this process if another one dies.
+
+    This is the barrier of the processes. That of the devices
+    (`jax.experimental.multihost_utils.sync_global_devices`) fails after half an hour on CPUs.
+    """
+    if jax.process_count() > 1:
+        assert distributed.global_state.client is not None
+        name = f"jaxgran.sweep {next(_BARRIERS)}: {event}"
+        distributed.global_state.client.wait_at_barrier(name, MAX_WAIT)
 
 
 def _stored_identity(path: Path) -> dict[str, Any] | None:

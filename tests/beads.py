@@ -24,7 +24,7 @@ def soft_beads(fraction=0.02, beta=0.15, dimension=3, packing_fraction=0.05) -> 
 
 def hard_gas(law=0.9, packing_fraction=0.05, dimension=3, **values) -> jaxgran.Gas:
     """A gas of diameter, mass and temperature 1: SI and reduced units are the same."""
-    if not isinstance(law, jaxgran.RestitutionLaw):
+    if not isinstance(law, jaxgran.extend.RestitutionLaw):
         law = jaxgran.ConstantRestitution(law)
     values = {"diameter": 1.0, "mass": 1.0, "temperature": 1.0} | values
     return jaxgran.Gas(law, packing_fraction=packing_fraction, dimension=dimension, **values)
@@ -33,6 +33,11 @@ def hard_gas(law=0.9, packing_fraction=0.05, dimension=3, **values) -> jaxgran.G
 def theory_curve(gas, taus, **settings) -> jaxgran.CoolingCurve:
     """The curve of kinetic theory at times in mean free times."""
     return jaxgran.cool(gas, taus * gas.mean_free_time, model=jaxgran.KineticTheory(**settings))
+
+
+def without(*names) -> frozenset[str]:
+    """All corrections of kinetic theory but these."""
+    return jaxgran.KineticTheory.all_corrections - {*names}
 
 
 def lattice(gas, n, replicas=1) -> jaxgran.Particles:

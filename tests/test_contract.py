@@ -37,7 +37,7 @@ from experiments.fit.own_model import HaffLaw
 from experiments.support.scenes import hard_beads
 from jaxgran import Rough, StokesDrag, Walls, WhiteNoise
 from jaxgran.data.curve import QUANTITIES
-from jaxgran.scene.parameters import FLOAT_UNITS
+from jaxgran.scene.parameters import PARAMETER_UNITS
 from tests.beads import assert_same, glass_beads, lattice, total_energy
 
 N, REPLICAS = 64, 2
@@ -54,7 +54,7 @@ OF_SOFT_SPHERES = ("friction", "container", "drag")
 class Case:
     """A model, a gas for it, the float in which curves are differentiated, and its elements."""
 
-    model: jaxgran.AbstractModel
+    model: jaxgran.extend.AbstractModel
     elements: tuple[str, ...]
     gas: jaxgran.Gas = BEADS
     parameter: str = "dissipative_constant"
@@ -410,8 +410,8 @@ class TestContract:
     @of_models()
     def test_units_do_not_matter(self, case):
         gas, start = case.gas, case.start
-        names = FLOAT_UNITS.keys() & gas.domains.keys()
-        floats = {name: in_other_units(gas.value(name), FLOAT_UNITS[name]) for name in names}
+        names = PARAMETER_UNITS.keys() & gas.domains.keys()
+        floats = {name: in_other_units(gas.value(name), PARAMETER_UNITS[name]) for name in names}
         gas, times = gas.replace(**floats), in_other_units(case.times, "s")
         if start is not None:
             start = start._replace(

@@ -1,6 +1,7 @@
 """The examples of the public docstrings run."""
 
 import doctest
+from operator import attrgetter
 
 import pytest
 
@@ -32,9 +33,10 @@ LONG = (
     *("imitate", "log_likelihood", "observables", "plan", "read_particles", "sweep"),
 )
 NAMES = [pytest.param(x, marks=pytest.mark.slow) if x in LONG else x for x in jaxgran.__all__]
+NAMES += [f"extend.{name}" for name in jaxgran.extend.__all__]
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_public_docstring_has_an_example_that_runs(name, names, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    run(getattr(jaxgran, name).__doc__, dict(names), name)
+    run(attrgetter(name)(jaxgran).__doc__, dict(names), name)

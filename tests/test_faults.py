@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran import Run
 from jaxgran._utils import tracing
 from jaxgran.data import checkpoint
+from jaxgran.extend import Run
 from jaxgran.particles import run as particle_run
 from jaxgran.particles import spheres as moving
 from tests.beads import glass_beads, spheres
@@ -158,7 +158,7 @@ def test_heavily_damped_impacts_end():
 
 OWN_LAW = """
 import jax, jax.numpy as jnp
-from jaxgran import ReducedLaw, RestitutionLaw
+from jaxgran.extend import ReducedLaw, RestitutionLaw
 from jaxgran.data.checkpoint import describe_run
 def slow(v): return FACTOR * jnp.ones_like(v)
 class Own(RestitutionLaw, ReducedLaw):

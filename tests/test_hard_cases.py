@@ -16,10 +16,10 @@ import jaxgran
 from experiments.support.closed_forms import haff
 from experiments.support.scenes import beads, cool
 from jaxgran import DSMC, HardSpheres, SoftSpheres
-from tests.beads import hard_gas, spheres
+from tests.beads import hard_gas, spheres, without
 
 FREE = "dissipative_constant"
-THEORY = jaxgran.KineticTheory(softness=False, order=2, correlations=False)
+THEORY = jaxgran.KineticTheory(corrections=without("softness", "correlations"), order=2)
 
 
 def worst(found, exact):

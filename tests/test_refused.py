@@ -12,7 +12,8 @@ import pytest
 
 import jaxgran
 from experiments.fit.own_model import HaffLaw
-from jaxgran import ReducedLaw, RestitutionLaw, observables
+from jaxgran import observables
+from jaxgran.extend import ReducedLaw, RestitutionLaw
 from tests.beads import SI, glass_beads, hard_gas, spheres
 
 NAN, INF = float("nan"), float("inf")
@@ -62,7 +63,7 @@ class OfMass(NotReduced, ReducedLaw):
     """A law with a float called like one of the gas."""
 
     mass: float = 1.0
-    domains = {"mass": jaxgran.Domain()}
+    domains = {"mass": jaxgran.extend.Domain()}
 
     def restitution(self, normal_speed):
         return 0.9 * jnp.ones_like(normal_speed)
@@ -88,7 +89,7 @@ class Open(RestitutionLaw):
     """A law whose float has a range of its own."""
 
     coefficient: float
-    domains = {"coefficient": jaxgran.Domain(0.0, 1.0)}
+    domains = {"coefficient": jaxgran.extend.Domain(0.0, 1.0)}
 
     def restitution(self, normal_speed):
         return self.coefficient
@@ -195,8 +196,8 @@ SCENES = [
     (lambda: cool(HOT), "T_0, to which the gas heats up.*SoftSpheres"),
     (lambda: jaxgran.KineticTheory(initial_sonine=-0.5), "initial_sonine must lie in .*got -0.5"),
     (
-        lambda: jaxgran.KineticTheory(initial_sonine=0.1, sonine=False),
-        "initial_sonine = 0.1 needs sonine=True",
+        lambda: jaxgran.KineticTheory(initial_sonine=0.1, corrections=()),
+        'initial_sonine = 0.1 needs "sonine" among',
     ),
     # settings of models
     (lambda: jaxgran.KineticTheory(order=4), "order must be 2 or 3, got 4"),
@@ -212,12 +213,18 @@ SCENES = [
     (lambda: jaxgran.SoftSpheres(10, projection=0.0), "projection must"),
     (lambda: jaxgran.SoftSpheres(10, steps_per_contact=5), "steps_per_contact"),
     # numbers
-    (lambda: jaxgran.Domain(0.0).check("speed", "steel", "Give m/s."), "in .0, inf., got .* Give"),
     (
-        lambda: jaxgran.Domain(0.0, 1.0, high_allowed=True).check("share", [1.0, 0.0]),
+        lambda: jaxgran.extend.Domain(0.0).check("speed", "steel", "Give m/s."),
+        "in .0, inf., got .* Give",
+    ),
+    (
+        lambda: jaxgran.extend.Domain(0.0, 1.0, high_allowed=True).check("share", [1.0, 0.0]),
         r"share must lie in \(0, 1\], got 0",
     ),
-    *((partial(jaxgran.Domain().check, "share", x), "share must lie in") for x in (NAN, INF, -INF)),
+    *(
+        (partial(jaxgran.extend.Domain().check, "share", x), "share must lie in")
+        for x in (NAN, INF, -INF)
+    ),
     (lambda: jaxgran.CoolingCurve(["steel"], [1.0]), "expected a number or an array of numbers"),
     (lambda: jaxgran.CoolingCurve([object()], [1.0]), "expected a number or an array of numbers"),
     (lambda: jaxgran.CoolingCurve([1.0, [2.0]], [1.0]), "expected a number or an array of numbers"),
@@ -296,7 +303,10 @@ CALLS = [
     ),
     (lambda: jaxgran.Viscoelastic("5e7", 0.2, 1e-6), "got '5e7'"),
     (lambda: GAS.replace(mass=True), "mass must be a number"),
-    (lambda: jaxgran.KineticTheory(sonine="no"), "must be True or False"),
+    *(
+        (partial(jaxgran.KineticTheory, x), "corrections must be a collection of some of")
+        for x in ("sonine", ["sonine", "heat"], False, [[]])
+    ),
     (lambda: jaxgran.DSMC(50, replicas=True), "whole number >= 1"),
     (lambda: jaxgran.SoftSpheres(20, projection="x"), "number"),
     (lambda: jaxgran.KineticTheory(rtol=-1), "rtol must lie in"),
@@ -374,7 +384,7 @@ FITS = [
     ({"free": (T_0, T_0)}, "different names"),
     (
         {"free": "law", "measurement": measured(gas=FIXED)},
-        'free="law", but the law Fixed has no floats',
+        'free="law", but the law Fixed has no parameters',
     ),
     ({"solver": "simplex"}, "solver must be a gradient transformation of optax"),
     (HAFF | {"measurement": measured(gas=GRAINS), "solver": optax.lbfgs()}, "line search"),

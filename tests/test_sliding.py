@@ -11,7 +11,7 @@ from scipy.special import gamma
 
 import jaxgran
 from jaxgran.theory.averages import slip_moments
-from tests.beads import hard_gas, theory_curve
+from tests.beads import hard_gas, theory_curve, without
 from tests.fitting.curves import synthetic
 
 
@@ -72,7 +72,7 @@ def test_drag_and_a_drive_leave_the_shape_of_spins(element, expected):
     rates = [rate / gas.mean_free_time for rate in rates]
     made = {"drag": jaxgran.StokesDrag, "drive": lambda x: jaxgran.WhiteNoise(x * gas.temperature)}
     gas = dataclasses.replace(gas, **{name: made[name](*rates)})
-    curve = theory_curve(gas, np.array([1.0, 3.0, 10.0, 30.0]), correlations=False)
+    curve = theory_curve(gas, np.array([1.0, 3.0, 10.0, 30.0]), corrections=without("correlations"))
     np.testing.assert_allclose(
         curve.rotational_temperature / curve.temperature, expected, rtol=5e-3
     )

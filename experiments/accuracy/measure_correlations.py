@@ -66,7 +66,8 @@ class Point(NamedTuple):
 @cache
 def enskog(point: Point) -> jaxgran.CoolingCurve:
     """Return the curve without correlations, at the times of `MARKS`."""
-    model = jaxgran.KineticTheory(correlations=False)
+    corrections = jaxgran.KineticTheory.all_corrections - {"correlations"}
+    model = jaxgran.KineticTheory(corrections=corrections)
     return cool(point.gas, times_of(point.gas, MARKS[1:], model, 4e3, 600), model)
 
 

@@ -32,7 +32,9 @@ from jaxgran import DSMC, HardSpheres
 from jaxgran.particles.dsmc.collisions import Scheme
 from jaxgran.particles.observables import third_sonine
 
-CHAOS = jaxgran.KineticTheory(softness=False, correlations=False)
+CHAOS = jaxgran.KineticTheory(
+    corrections=jaxgran.KineticTheory.all_corrections - {"softness", "correlations"}
+)
 
 
 def dsmc_million(options: Options):
@@ -188,9 +190,9 @@ def spins(options: Options):
             times = np.array([1.0, 3.0, 10.0, 30.0, 100.0]) * float(gas.mean_free_time)
             simulated = cool(gas, times, DSMC(size, replicas=replicas))
             row = {"dimension": dimension, "mu": mu, "beta": beta, "eps": eps, "ratio": ratio}
-            for name, cumulants in (("off", True), ("gaussian", False)):
-                model = dataclasses.replace(CHAOS, spin_cumulants=cumulants)
-                theory = cool(gas, times, model)
+            gaussian = {*CHAOS.corrections} - {"spin_cumulants"}
+            for name, corrections in (("off", CHAOS.corrections), ("gaussian", gaussian)):
+                theory = cool(gas, times, dataclasses.replace(CHAOS, corrections=corrections))
                 T = theory.temperature / simulated.temperature
                 row[f"T_{name}"] = T - 1
                 ratios = theory.rotational_temperature / simulated.rotational_temperature / T

@@ -34,8 +34,10 @@ import jaxgran
 from experiments.support.record import DATA, Options, run_parts
 from experiments.support.scenes import cool
 
-THEORY = jaxgran.KineticTheory(softness=False)
-ENSKOG = jaxgran.KineticTheory(softness=False, correlations=False)
+THEORY = jaxgran.KineticTheory(corrections=jaxgran.KineticTheory.all_corrections - {"softness"})
+ENSKOG = jaxgran.KineticTheory(
+    corrections=jaxgran.KineticTheory.all_corrections - {"softness", "correlations"}
+)
 STORED = DATA / "run_statistics.npz"
 DEPTH = 3.5
 """Largest ln(T_0/T) of gases that cool."""
@@ -48,7 +50,7 @@ def beads(law: Any = None, packing_fraction: float = 0.03, dimension: int = 3, *
     """Return 3 mm beads, viscoelastic without a law or with a constant restitution."""
     if law is None:
         law = jaxgran.Viscoelastic(6e10, 0.24, 2.5e-7)
-    elif not isinstance(law, jaxgran.RestitutionLaw):
+    elif not isinstance(law, jaxgran.extend.RestitutionLaw):
         law = jaxgran.ConstantRestitution(law)
     return jaxgran.Gas(
         law,
@@ -220,8 +222,8 @@ def row_of(scene: Scene, name: str, kind: str, runs: Runs) -> dict[str, Any]:
     return row
 
 
-def floats_of(gas: jaxgran.Gas) -> dict[str, list]:
-    return {name: np.asarray(x).tolist() for name, x in gas.floats.items()}
+def parameters_of(gas: jaxgran.Gas) -> dict[str, list]:
+    return {name: np.asarray(x).tolist() for name, x in gas.parameters.items()}
 
 
 def store(statistics: dict[str, dict[str, Any]]) -> None:
@@ -241,9 +243,9 @@ def statistics_of(scene: Scene, times: np.ndarray, runs: Runs) -> dict[str, Any]
     joint = runs.joint
     covariance = np.cov(joint, rowvar=False)
     lower = covariance[np.tril_indices(len(covariance))].astype(np.float32)
-    floats = json.dumps(floats_of(scene.make()))
+    parameters = json.dumps(parameters_of(scene.make()))
     mean = joint.mean(axis=0).astype(np.float32)
-    values = floats, scene.num_particles, len(joint), times, mean, lower
+    values = parameters, scene.num_particles, len(joint), times, mean, lower
     return dict(zip(FIELDS, values, strict=True))
 
 

@@ -104,9 +104,9 @@ def impacts(steps_per_contact, phases: int) -> dict:
         rows = []
         for steps in steps_per_contact:
             model = jaxgran.SoftSpheres(2, replicas=phases, steps_per_contact=steps, start=start)
-            plan = model.sized_for(gas).plan
+            sizes = model.sized_for(gas)._sizes
             capacity = Capacity(phases, 2, phases, phases, 2 * phases)  # all collide at once
-            model = dataclasses.replace(model, plan=plan._replace(capacity=capacity))
+            model = dataclasses.replace(model, _sizes=sizes._replace(capacity=capacity))
             end = cool(gas, [2 * contact], model)
             assert np.all(np.asarray(end.replicas.collisions) == 1)
             after = np.asarray(end.particles.velocity[:, 0] - end.particles.velocity[:, 1])

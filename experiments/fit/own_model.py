@@ -19,7 +19,7 @@ from experiments.support.record import run_parts
 from experiments.support.scenes import hard_beads
 
 
-class HaffLaw(jaxgran.AbstractModel):
+class HaffLaw(jaxgran.extend.AbstractModel):
     """Haff's law: spheres of constant restitution, whose velocities stay Maxwellian."""
 
     stochastic: ClassVar[bool] = False  # curves have no noise
@@ -43,7 +43,7 @@ class HaffLaw(jaxgran.AbstractModel):
         if float(gas.value("coefficient")) > 0.7:
             return ()
         remedy = "This scene needs kinetic theory, which includes a_2."
-        return (jaxgran.Limitation("velocities are not Maxwellian", True, remedy),)
+        return (jaxgran.extend.Limitation("velocities are not Maxwellian", True, remedy),)
 
 
 def own_model(_) -> dict:

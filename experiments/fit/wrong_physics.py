@@ -21,7 +21,7 @@ diameters are distributed evenly within 10 % of their mean, or half of the spher
 times as large as the others; masses are proportional to the cubes of diameters, and T is the mean
 square velocity over 3. In the rows of scatter eps of each impact is a normal random number, clipped
 to 0 to 1, whose mean is the law. Both are simulated by `unlike_spheres`. Contacts of hard spheres
-have no duration, so kinetic theory is used with `softness=False`.
+have no duration, so kinetic theory is used without "softness".
 """
 
 import dataclasses
@@ -44,7 +44,7 @@ NORMAL = 1.96
 SEEN = 2.2
 """Largest speed that is seen, in sqrt(2 T)."""
 
-THEORY = jaxgran.KineticTheory(softness=False)
+THEORY = jaxgran.KineticTheory(corrections=jaxgran.KineticTheory.all_corrections - {"softness"})
 
 
 def beads(**elements) -> jaxgran.Gas:

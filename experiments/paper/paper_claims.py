@@ -73,7 +73,11 @@ def beads_of(delta: float) -> jaxgran.Gas:
 def cooled(delta: float, u) -> tuple[jaxgran.Gas, jaxgran.CoolingCurve]:
     """Return dilute viscoelastic beads of a given delta, cooled to times u = 1 + t/tau_0."""
     gas, tau = beads_of(delta), (jnp.asarray(u) - 1) / (RATE * delta)
-    model = jaxgran.KineticTheory(softness=False, order=2, correlations=False, rtol=1e-11)
+    model = jaxgran.KineticTheory(
+        corrections=jaxgran.KineticTheory.all_corrections - {"softness", "correlations"},
+        order=2,
+        rtol=1e-11,
+    )
     return gas, jaxgran.cool(gas, tau * gas.mean_free_time, model=model)
 
 
@@ -148,7 +152,9 @@ def laws() -> dict:
 
 def relaxation_of_cooling_state(eps: float) -> float:
     """Return 1/tau_v of the cooling state over that of a Maxwellian gas at this T, less 1."""
-    gas, model = hard_beads(0.01, eps), jaxgran.KineticTheory(correlations=False)
+    gas = hard_beads(0.01, eps)
+    corrections = jaxgran.KineticTheory.all_corrections - {"correlations"}
+    model = jaxgran.KineticTheory(corrections=corrections)
     curve = jaxgran.cool(gas, jnp.array([1e3, 1e4]) * gas.mean_free_time, model=model)
     moments = impact_moments(gas.reduced_law, jnp.ones(()), 3, order=3)[3]
     i, j = np.array(TERMS[3])

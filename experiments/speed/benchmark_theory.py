@@ -61,7 +61,7 @@ CURVE = EXAMPLE_FILES["dilute"]
 TASKS = "reference", "fit", "lengths", "command", "SoftSpheres", "HardSpheres", "DSMC"
 RTOL, SCIPY_RTOL = 1e-7, 1e-9  # both give the same accuracy
 REFERENCE = "first Jacobian"
-SAME_EQUATIONS = {"order": 2, "softness": False, "correlations": False}
+SAME_EQUATIONS = {"order": 2, "corrections": {"sonine", "diffusion", "spin_cumulants"}}
 """Options for which kinetic theory solves the equations that are written here for SciPy."""
 
 
@@ -76,7 +76,7 @@ def times() -> np.ndarray:
     return np.geomspace(1e-1, 1e4, 50) * float(scene().mean_free_time)
 
 
-def at(constant, model: jaxgran.AbstractModel | None = None) -> jax.Array:
+def at(constant, model: jaxgran.extend.AbstractModel | None = None) -> jax.Array:
     """Return T with a dissipative constant."""
     gas = scene().replace(dissipative_constant=constant)
     return jaxgran.cool(gas, jnp.asarray(times()), model=model).temperature

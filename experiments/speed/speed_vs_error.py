@@ -94,7 +94,7 @@ class Run(NamedTuple):
     """A row: its settings in words, the model, the gas (or a softer one), and the precision."""
 
     knob: str
-    model: jaxgran.AbstractModel
+    model: jaxgran.extend.AbstractModel
     gas: jaxgran.Gas
     double: bool = True
 

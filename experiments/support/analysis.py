@@ -14,7 +14,9 @@ from experiments.support.scenes import beads, cool, hard_beads, restitution_like
 PACKING = 0.05
 """Packing fraction of the gases of `gases_of`."""
 
-ENSKOG = jaxgran.KineticTheory(softness=False, correlations=False)
+ENSKOG = jaxgran.KineticTheory(
+    corrections=jaxgran.KineticTheory.all_corrections - {"softness", "correlations"}
+)
 
 
 def replicas_of(curve: jaxgran.CoolingCurve, name: str) -> np.ndarray:

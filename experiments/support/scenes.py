@@ -43,7 +43,7 @@ def beads(
     return gas.replace(dissipative_constant=1e-6 * beta / float(gas.thermal_beta))
 
 
-class Power(jaxgran.RestitutionLaw):
+class Power(jaxgran.extend.RestitutionLaw):
     """``eps = (v/v_1)^-p``, and 1 below the speed v_1, m/s."""
 
     speed: float

@@ -83,7 +83,7 @@ ENERGY_DRIFT = Fault(
 )
 OUT_OF_RANGE = Fault(
     4096,
-    "a float of the gas lies outside its range, or the times do not increase from 0 or later",
+    "a parameter of the gas lies outside its range, or the times do not increase from 0 or later",
     "see gas.domains for the ranges, and sort the times",
 )
 UNSUPPORTED = Fault(

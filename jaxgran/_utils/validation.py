@@ -22,7 +22,7 @@ class Domain(NamedTuple):
         low, high: the ends; may be infinite.
         low_allowed, high_allowed: whether the end itself is allowed.
 
-    >>> positive = jaxgran.Domain(low=0.0)
+    >>> positive = jaxgran.extend.Domain(low=0.0)
     >>> str(positive), bool(positive.contains(-1.0))
     ('(0, inf)', False)
     """

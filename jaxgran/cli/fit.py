@@ -235,7 +235,7 @@ def choose_or_make_model(
     path: Path,
     measurements: dict[str, jaxgran.Measurement],
     request: dict[str, Any],
-) -> tuple[jaxgran.AbstractModel, tuple[str, ...]]:
+) -> tuple[jaxgran.extend.AbstractModel, tuple[str, ...]]:
     """Return the model, and the reasons for it if it was chosen automatically."""
     if options.model == JOINT_MODEL:
         return jaxgran.KineticTheory(), ()

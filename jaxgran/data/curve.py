@@ -443,7 +443,7 @@ class Run(NamedTuple):
             becomes `CoolingCurve.saved`. None saves nothing.
         trajectory: file to which the particles are written at each time, or None.
 
-    >>> jaxgran.Run(progress=False).checkpoint is None
+    >>> jaxgran.extend.Run(progress=False).checkpoint is None
     True
     """
 

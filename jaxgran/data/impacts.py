@@ -242,8 +242,8 @@ def _of_velocities(table: Table, onto: str) -> DropTest:
         )
     sideways = before + speed[:, None] * normal
     tangential = np.linalg.norm(sideways, axis=1)
-    along = sideways / np.where(tangential > 0, tangential, 1.0)[:, None]
-    eps_t = np.sum(after * along, axis=1) / np.where(tangential > 0, tangential, 1.0)
+    direction = sideways / np.where(tangential > 0, tangential, 1.0)[:, None]
+    eps_t = np.sum(after * direction, axis=1) / np.where(tangential > 0, tangential, 1.0)
     return DropTest(
         speed,
         speed_after / speed,

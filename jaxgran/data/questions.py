@@ -6,6 +6,7 @@ turns it into a warning; the values are used as they are.
 
 from collections.abc import Iterator
 from math import sqrt
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -65,6 +66,50 @@ USUAL_LOSS = (1e-3, 3.0)
 MAX_ERROR_RATIO = 10.0
 """Ratio of T_err to the scatter of N particles, or its inverse, above which a question is asked."""
 
+QUESTIONS = {
+    # units
+    "unusual": "{name} is {value:.6g} {base}, and usual is {low:g} to {high:g}: {question}",
+    "any unit": "check its unit",
+    "any unit of T": "check its unit (kelvin times 1.38e-23 J/K over the mass are m^2/s^2)",
+    "unit of a key": "is it in {unit}? Then write {name}: {in_si:.6g}, or {name}: {value:g} {unit}",
+    "unit of a column": "is it in {unit}? Then write {name} ({unit}) as the name of the column",
+    "T0 is 1": "T0 is 1 m^2/s^2: is the temperature divided by its first value? Then give T0 in "
+    "m^2/s^2, and multiply T by it",
+    "large error": "{key}_err is {error:.6g} {unit}, more than {key}, {value:.6g}: a number "
+    "without a unit has that of {key}. Is it in {unit}? Then write it behind",
+    # errors
+    "T_err and N": "T_err is at least {ratio:.2g} times {word} than the scatter of T of N = "
+    "{number:g} particles in {replicas:g} run(s): are N, replicas and T_err those of this curve, "
+    "and is T_err a standard error of the mean?",
+    "digits": "{column}_err, {error:.2g}, is less than the digits of {column} tell, "
+    "{digit:.2g}/sqrt(12): the rounding counts as an error in addition. Write more digits of "
+    "{column}",
+    # the start and the loss
+    "late start": "T is T0 = {T0:g} m^2/s^2 at t = {begin:.6g} s and not at 0, by the first rows: "
+    "does the clock of the file start earlier than the gas? Then subtract that time, or fit it: "
+    "--free A t0",
+    "loss": "T falls to a half in {halving:.3g} mean free times of the header's gas (eta, "
+    "diameter, T0), and usual is .1 to 1e3: {question}",
+    "unit of t": "is t in {units}? Then name the column t ({unit})",
+    "any unit of the header": "are t, eta, diameter and T0 in the units that the file says?",
+    "steps": "; is it in steps or frames? Then multiply it by their duration",
+    # the definition of T
+    "mean_speed": "mean_speed is taken for that of all three components. If it is of the two that "
+    "one camera sees, T is .62 times too small and A 37 % too large: name the column mean_speed_xy "
+    "then, and mean_speed_xyz otherwise",
+    "scale": "T is {first:.4g} at first, {ratio:.3g} times the header's T0 = {T0:g} m^2/s^2: "
+    "{question}. If T is right, correct T0",
+    "definition": "is the column {words}? Then {rename}multiply {what} by {factor:.6g}",
+    "rename": "name the column {column}, or ",
+    "any definition": "are both <v^2>/d of one grain, in m^2/s^2? (Neither kelvin, nor the energy "
+    "of all N grains, nor T over its first value)",
+}
+"""Questions and their parts by name, with places for values."""
+
+
+def _ask(name: str, /, **values: Any) -> str:
+    return QUESTIONS[name].format(**values)
+
 
 def _is_usual(name: str, value: float) -> bool:
     low, high = USUAL_RANGES.get(name, (-np.inf, np.inf))
@@ -75,34 +120,31 @@ def ask_about_header(values: dict[str, float]) -> Iterator[str]:
     """Yield questions about unusual values of header keys, in SI."""
     for key, value in values.items():
         if not _is_usual(key, value):
-            yield _unit_question(key, value, f"{key}: ")
+            yield _unit_question(key, value, "unit of a key")
         error = values.get(f"{key}_err", 0.0)
         if key == "T0" and value == 1:
-            yield (
-                "T0 is 1 m^2/s^2: is the temperature divided by its first value? Then give T0 in "
-                "m^2/s^2, and multiply T by it"
-            )
+            yield _ask("T0 is 1")
         if key != "t0" and error > value > 0:
-            yield (
-                f"{key}_err is {error:.6g} {UNITS[key]}, more than {key}, {value:.6g}: a number "
-                f"without a unit has that of {key}. Is it in {UNITS[key]}? Then write it behind"
-            )
+            yield _ask("large error", key=key, error=error, unit=UNITS[key], value=value)
 
 
-def _unit_question(name: str, value: float, line: str) -> str:
+def _unit_question(name: str, value: float, advice: str) -> str:
+    """Return the question on an unusual value, with the unit in which it would be usual.
+
+    Args:
+        name: of a header key or a column.
+        value: in SI.
+        advice: the name in `QUESTIONS` of what to write if such a unit is found.
+    """
     low, high = USUAL_RANGES[name]
     base = UNITS[name]
-    question = "check its unit"
-    if base == "m^2/s^2":
-        question += " (kelvin times 1.38e-23 J/K over the mass are m^2/s^2)"
+    question = _ask("any unit of T" if base == "m^2/s^2" else "any unit")
     for unit in OTHER_UNITS[base]:
         in_si = unit_in(unit, base) * value
         if _is_usual(name, in_si):
-            rewritten = f"{line}{in_si:.6g}, or {line}{value:g} {unit}"
-            rewritten = rewritten if line else f"{name} ({unit}) as the name of the column"
-            question = f"is it in {unit}? Then write {rewritten}"
+            question = _ask(advice, name=name, unit=unit, value=value, in_si=in_si)
             break
-    return f"{name} is {value:.6g} {base}, and usual is {low:g} to {high:g}: {question}"
+    return _ask("unusual", name=name, value=value, base=base, low=low, high=high, question=question)
 
 
 def ask_about_speeds(columns: dict[str, np.ndarray]) -> Iterator[str]:
@@ -110,7 +152,7 @@ def ask_about_speeds(columns: dict[str, np.ndarray]) -> Iterator[str]:
     for name in SPEEDS & columns.keys():
         largest = float(np.max(np.abs(columns[name])))
         if not _is_usual(name, largest):
-            yield _unit_question(name, largest, "")
+            yield _unit_question(name, largest, "unit of a column")
 
 
 def scene_of(header: dict[str, str]) -> Scene:
@@ -147,18 +189,14 @@ def ask_about_columns(
         column: from which T was read.
     """
     if column == "mean_speed" and scene_of(header).d == 3:
-        yield (
-            "mean_speed is taken for that of all three components. If it is of the two that one "
-            "camera sees, T is .62 times too small and A 37 % too large: name the column "
-            "mean_speed_xy then, and mean_speed_xyz otherwise"
-        )
+        yield _ask("mean_speed")
     yield from _ask_about_digits(curve, rounding or {})
     for quantity in QUANTITIES.values():
         values = getattr(curve, quantity.field)
         if quantity.measured and values is not None and not quantity.column.endswith("_err"):
             largest = float(np.max(np.asarray(values)))
             if largest > 0 and not _is_usual(quantity.column, largest):
-                yield _unit_question(quantity.column, largest, "")
+                yield _unit_question(quantity.column, largest, "unit of a column")
     if gas is None or gas.drive is not None:
         return
     if not all(_is_usual(key, float(header[key])) for key in REQUIRED if key in header):
@@ -173,11 +211,7 @@ def ask_about_columns(
         ratios = {"larger": share[1:].min() / expected, "smaller": expected / share.max()}
         for word, ratio in ratios.items():
             if ratio > MAX_ERROR_RATIO:
-                yield (
-                    f"T_err is at least {ratio:.2g} times {word} than the scatter of T of N = "
-                    f"{number:g} particles in {replicas:g} run(s): are N, replicas and T_err those "
-                    "of this curve, and is T_err a standard error of the mean?"
-                )
+                yield _ask("T_err and N", ratio=ratio, word=word, number=number, replicas=replicas)
 
 
 def _ask_about_digits(curve: CoolingCurve, rounding: dict[str, np.ndarray]) -> Iterator[str]:
@@ -190,11 +224,7 @@ def _ask_about_digits(curve: CoolingCurve, rounding: dict[str, np.ndarray]) -> I
         coarse = given & (np.asarray(errors) < digit / sqrt(12))
         if np.sum(coarse) > np.sum(given) / 2:
             i = int(np.argmax(coarse))
-            yield (
-                f"{column}_err, {errors[i]:.2g}, is less than the digits of {column} tell, "
-                f"{digit[i]:.2g}/sqrt(12): the rounding counts as an error in addition. Write more "
-                f"digits of {column}"
-            )
+            yield _ask("digits", column=column, error=errors[i], digit=digit[i])
 
 
 def _ask_about_start(
@@ -221,25 +251,18 @@ def _ask_about_start(
     if first > MAX_RATIO + chance + known:
         yield _scale_question(first, gas, header, column)
     elif begin > MAX_LATENESS * halving and begin > 0.5 * times[0]:
-        yield (
-            f"T is T0 = {T0:g} m^2/s^2 at t = {begin:.6g} s and not at 0, by the first rows: does "
-            "the clock of the file start earlier than the gas? Then subtract that time, or fit it: "
-            "--free A t0"
-        )
+        yield _ask("late start", T0=T0, begin=begin)
     elif at_zero < 1 / (MAX_RATIO + chance + known):
         yield _scale_question(at_zero, gas, header, column)
     loss = gas.dimension * slope / (0.6 * origin) / float(_collision_frequency(gas))
     if T[-1] < 0.8 * T[0] and not USUAL_LOSS[0] <= loss <= USUAL_LOSS[1]:
         units = [unit for unit in OTHER_UNITS["s"] if 1e-3 < loss / unit_in(unit, "s") < 1]
-        question = "are t, eta, diameter and T0 in the units that the file says?"
+        question = _ask("any unit of the header")
         if units:
-            question = f"is t in {' or '.join(units)}? Then name the column t ({units[0]})"
+            question = _ask("unit of t", units=" or ".join(units), unit=units[0])
         if loss < 1:
-            question += "; is it in steps or frames? Then multiply it by their duration"
-        yield (
-            f"T falls to a half in {halving / float(gas.mean_free_time):.3g} mean free times of "
-            f"the header's gas (eta, diameter, T0), and usual is .1 to 1e3: {question}"
-        )
+            question += _ask("steps")
+        yield _ask("loss", halving=halving / float(gas.mean_free_time), question=question)
 
 
 @eqx.filter_jit
@@ -255,16 +278,10 @@ def _scale_question(ratio: float, gas: Gas, header: dict[str, str], column: str)
     T0 = float(gas.temperature)
     causes = []
     for definition, factor in other_definitions(ratio, column, scene_of(header)):
-        name = f"name the column {definition.column}, or " if definition.column else ""
+        rename = _ask("rename", column=definition.column) if definition.column else ""
+        what = "it" if definition.power == 1 else "T"
         causes.append(
-            f"is the column {definition.words}? Then {name}multiply "
-            + (f"it by {factor:.6g}" if definition.power == 1 else f"T by {factor:.6g}")
+            _ask("definition", words=definition.words, rename=rename, what=what, factor=factor)
         )
-    question = ". Or ".join(causes) or (
-        "are both <v^2>/d of one grain, in m^2/s^2? (Neither kelvin, nor the energy of all N "
-        "grains, nor T over its first value)"
-    )
-    return (
-        f"T is {ratio * T0:.4g} at first, {ratio:.3g} times the header's T0 = {T0:g} m^2/s^2: "
-        f"{question}. If T is right, correct T0"
-    )
+    question = ". Or ".join(causes) or _ask("any definition")
+    return _ask("scale", first=ratio * T0, ratio=ratio, T0=T0, question=question)

@@ -197,14 +197,17 @@ def read_table(
     header |= _with_usual_keys(given)
     units = _pop_units(header)
     units_of_rows = _pop_head_rows(rows, names)
-    told = [_name_and_unit(name) for name in names]
-    told = [(name, unit or units_of_rows.get(k, "")) for k, (name, unit) in enumerate(told)]
-    bare_names = [name for name, _ in told]
+    bare_names = []
+    units_given = {}
+    for k, name in enumerate(names):
+        bare, unit = _name_and_unit(name)
+        bare_names.append(bare)
+        units_given[bare] = unit or units_of_rows.get(k, "")
     try:
         chosen = list(columns_to_read([name for name in bare_names if name]))
     except ValueError as error:
         raise ValueError(f"line {first}: {error}") from None
-    factors = [_factor(name, dict(told), units, "column") for name in bare_names]
+    factors = [_factor(name, units_given, units, "column") for name in bare_names]
     at = [bare_names.index(name) for name in chosen]
     without = _pop_rows_without_identity(
         rows, [k for k in at if bare_names[k] in identities], len(names)
@@ -228,7 +231,7 @@ def read_table(
     numbers = np.reshape(values, (len(rows), len(at))).T * np.array([[factors[k]] for k in at])
     columns = dict(zip(chosen, numbers, strict=True))
     for name in chosen:
-        if _is_relative(name, dict(told)):
+        if _is_relative(name, units_given):
             columns[name] = columns[name] * np.abs(columns[name.removesuffix("_err")])
     return Table(
         _convert_header(header, units, comma),
@@ -236,7 +239,7 @@ def read_table(
         list(rows),
         {name: [row[k] for row in rows.values()] for name, k in zip(chosen, at, strict=True)},
         {name: factors[k] for name, k in zip(chosen, at, strict=True)},
-        {name: dict(told)[name] for name in chosen},
+        {name: units_given[name] for name in chosen},
         without,
     )
 
@@ -384,10 +387,10 @@ def _base_unit(name: str, units: dict[str, str] = UNITS) -> str | None:
 def _pop_units(header: dict[str, str]) -> dict[str, str]:
     """Remove the header keys of units; return the unit of numbers without one, by its SI unit."""
     speed_given = "speed_unit" in header
-    told = {key: header.pop(key, unit) for key, unit in UNIT_KEYS.items()}
-    for key in told:
-        _factor(key, told, {}, "header line")
-    length, time, speed = told.values()
+    units_given = {key: header.pop(key, unit) for key, unit in UNIT_KEYS.items()}
+    for key in units_given:
+        _factor(key, units_given, {}, "header line")
+    length, time, speed = units_given.values()
     if not speed_given:
         speed = f"{length}/{time}"
     return {
@@ -427,7 +430,7 @@ def _convert_header(header: dict[str, str], units: dict[str, str], comma: bool) 
         match = (_SIDES if key == "container_side" else _NUMBER).match(text)
         if match is not None:
             parts[key] = match[0], text[match.end() :].strip()
-    told = {key: unit for key, (_, unit) in parts.items()}
+    units_given = {key: unit for key, (_, unit) in parts.items()}
     converted = dict(header)
     for key, (text, unit) in parts.items():
         if unit and _base_unit(key, HEADER_UNITS) is None:
@@ -435,13 +438,13 @@ def _convert_header(header: dict[str, str], units: dict[str, str], comma: bool) 
         numbers = [_plain_number(part.strip(), comma) for part in re.split("[x×]", text)]
         if any("," in number for number in numbers):
             continue
-        factor = _factor(key, told, units, "header line")
+        factor = _factor(key, units_given, units, "header line")
         if factor != 1:
             numbers = [repr(factor * float(number)) for number in numbers]
         converted[key] = " x ".join(numbers)
     for key in parts:
         value = converted.get(key.removesuffix("_err"), "1")
-        if _is_relative(key, told) and _NUMBER.fullmatch(value):
+        if _is_relative(key, units_given) and _NUMBER.fullmatch(value):
             converted[key] = repr(float(converted[key]) * abs(float(value)))
     return converted
 
@@ -494,13 +497,13 @@ def _is_dimensionless(unit: str) -> bool:
         return False
 
 
-def _is_relative(name: str, told: dict[str, str]) -> bool:
+def _is_relative(name: str, units_given: dict[str, str]) -> bool:
     """Return whether a standard error is a part of its value, as one in % is.
 
     It is not if the value has the same unit.
     """
-    unit = told.get(name, "")
-    value = told.get(name.removesuffix("_err"), "")
+    unit = units_given.get(name, "")
+    value = units_given.get(name.removesuffix("_err"), "")
     return name.endswith("_err") and unit != value and _is_dimensionless(unit)
 
 
@@ -516,20 +519,20 @@ def _name_and_unit(name: str) -> tuple[str, str]:
     return bare, match["bracket"] or match["slash"] or ""
 
 
-def _factor(name: str, told: dict[str, str], units: dict[str, str], kind: str) -> float:
+def _factor(name: str, units_given: dict[str, str], units: dict[str, str], kind: str) -> float:
     """Return the value in SI of the unit of a name.
 
     Args:
         name: of a column or a header key; a standard error without a unit has that of its value.
-        told: the units that stand behind names.
+        units_given: the units that stand behind names.
         units: the units of other numbers, by SI unit.
         kind: of the name, for messages.
     """
     base = _base_unit(name)
     if base is None:
         return 1.0
-    unit = told[name] or told.get(name.removesuffix("_err")) or units.get(base, base)
-    if _is_relative(name, told):
+    unit = units_given[name] or units_given.get(name.removesuffix("_err")) or units.get(base, base)
+    if _is_relative(name, units_given):
         return unit_in(unit, "1")
     if unit in (base, base.replace("m^2/s^2", "(m/s)^2")):
         return 1.0

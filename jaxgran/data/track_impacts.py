@@ -614,8 +614,8 @@ def _meeting(
     turned = np.where(is_wall, 0.0, 1 / diameter)[:, None]
 
     def by_separation(u: np.ndarray) -> np.ndarray:
-        along = np.sum(u * g, axis=1) * slope
-        return turned * (u - normal * along[:, None])
+        normal_change = np.sum(u * g, axis=1) * slope
+        return turned * (u - normal * normal_change[:, None])
 
     D = -by_separation(g)
     C = by_separation(g_after)

@@ -556,19 +556,19 @@ def curve_of_trajectory(
 def _add_to_header(header: dict[str, str], frame: Frame) -> None:
     """Add what a frame says of the gas; raise ValueError if the header contradicts it."""
     (N, d), equal = frame.position.shape, frame.equal
-    told: dict[str, float] = {"N": N, "dimension": d}
+    from_file: dict[str, float] = {"N": N, "dimension": d}
     if "diameter" in equal or "radius" in equal:
         sigma = float(equal["diameter"][0] if "diameter" in equal else 2 * equal["radius"][0])
         if sigma != GSD_DEFAULT:
-            told["diameter"] = sigma
+            from_file["diameter"] = sigma
             if "density" in equal:
-                told["density"] = float(equal["density"][0])
+                from_file["density"] = float(equal["density"][0])
             elif "mass" in equal:
-                told["density"] = float(equal["mass"][0] / sphere_mass(sigma, 1.0))
+                from_file["density"] = float(equal["mass"][0] / sphere_mass(sigma, 1.0))
             if frame.periodic:
                 volume = float(np.prod(frame.sides))
-                told["eta"] = N * (pi / 6 if d == 3 else pi / 4) * sigma**d / volume
-    for key, value in told.items():
+                from_file["eta"] = N * (pi / 6 if d == 3 else pi / 4) * sigma**d / volume
+    for key, value in from_file.items():
         tolerance = 0.0 if key in ("N", "dimension") else HEADER_TOLERANCE
         if abs(header_number(header, key) - value if key in header else 0.0) > tolerance * value:
             raise ValueError(f"{key} is {value:g}, but {header[key]} in the header or before")

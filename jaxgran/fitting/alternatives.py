@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.goodness import SIGNIFICANCE, goodness
-from jaxgran.fitting.parameters import as_floats, with_floats
+from jaxgran.fitting.parameters import as_floats, with_parameters
 from jaxgran.fitting.prediction import FLOOR, WHITE
 from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.rows import CurveRows
@@ -279,8 +279,8 @@ def compare_alternatives(
         # Such a curve prefers whatever has less noise.
         significant = np.inf
     summary = _Summary(problem, bases[0], best, significant, noise)
-    law = summary.of(None, [[base] for base in bases])
-    alternatives = [summary.of(kind, found, law) for kind, found in profiles.items()]
+    law = summary.build(None, [[base] for base in bases])
+    alternatives = [summary.build(kind, found, law) for kind, found in profiles.items()]
     best_first = sorted(alternatives, key=lambda alternative: -alternative.improvement)
     return Explanations(law, tuple(best_first))
 
@@ -294,7 +294,7 @@ class _Summary(NamedTuple):
     significant: float
     noise: Float[np.ndarray, "p"]
 
-    def of(
+    def build(
         self, kind: Kind | None, profiles: list[list[Trial]], law: Alternative | None = None
     ) -> Alternative:
         """Return an alternative from its trials, interpolated between the amplitudes."""
@@ -500,7 +500,7 @@ def constant_restitution(problem: Problem, trial: Trial) -> float:
     m = problem.curves[0]
     values = problem.values(trial.flat)[m.label]
     known = {name: x for name, x in values.items() if name in m.gas.domains}
-    gas = with_floats(m.gas, as_floats(known | {"exponent": 0.0}))
+    gas = with_parameters(m.gas, as_floats(known | {"exponent": 0.0}))
     return float(gas.restitution(VARIANT_SPEED))
 
 

@@ -23,7 +23,7 @@ from jaxgran.fitting.information import (
 )
 from jaxgran.fitting.messages import say, with_words
 from jaxgran.fitting.outliers import without_outliers
-from jaxgran.fitting.parameters import as_floats, with_floats
+from jaxgran.fitting.parameters import as_floats, with_parameters
 from jaxgran.fitting.problem import Evaluation, Problem
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.rows import SCATTER, TINY, CurveRows
@@ -180,7 +180,7 @@ def assembled(
     curves: dict[str, CoolingCurve | None] = {}
     for m in problem.measurements:
         floats = {n: x for n, x in values[m.label].items() if n in m.scene.domains}
-        gases[m.label] = with_floats(m.scene, as_jax_arrays(as_floats(floats)))
+        gases[m.label] = with_parameters(m.scene, as_jax_arrays(as_floats(floats)))
         curves[m.label] = None
         if isinstance(m, CurveRows):
             curves[m.label] = _as_curve(m, found.curves[m.label])

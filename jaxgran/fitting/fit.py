@@ -74,8 +74,8 @@ def fit(
     Args:
         measurement: a `jaxgran.Measurement`, or a dictionary of them by label: measurements of one
             material.
-        model: a `jaxgran.AbstractModel`, by default `jaxgran.KineticTheory()`; a stochastic model
-            needs two or more replicas.
+        model: a `jaxgran.extend.AbstractModel`, by default `jaxgran.KineticTheory()`; a stochastic
+            model needs two or more replicas.
         free: names of the free parameters: those of the gas or its law, such as "temperature"
             (T_0), or their symbols in files, such as "T0"; or "t0", the time at which the gas had
             T_0 and began to cool, if the clock was not started then; "law" stands for all numbers

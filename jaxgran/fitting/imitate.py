@@ -215,7 +215,8 @@ def _imitated(
     of_start, of_errors = jax.random.split(key)
     curve = cool(gas, times, model=several, key=of_start, progress=progress)
     twins = _measured(measurement, result, curve, runs, of_errors)
-    theory = KineticTheory(softness=False, correlations=not isinstance(model, DSMC))
+    without = {"softness", "correlations"} if isinstance(model, DSMC) else {"softness"}
+    theory = KineticTheory(corrections=KineticTheory.all_corrections - without)
     fits: list[Fit] = []
     bar = tqdm(twins, desc="fits", delay=3, disable=None if progress else True)
     with warnings.catch_warnings():

@@ -22,7 +22,7 @@ from jaxgran.scene.laws import C1, ConstantRestitution, RestitutionSpline, Visco
 from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
 
 LAW = "law"
-"""Name that stands for all floats of the law of restitution."""
+"""Name that stands for all parameters of the law of restitution."""
 
 SHARED = ""
 """Label of the priors of parameters that all measurements share."""
@@ -47,25 +47,25 @@ def domain_of(gas: Gas, name: str) -> Domain:
 
 
 def with_names_of_law(names: Any, gas: Gas) -> Any:
-    """Return names of free parameters with those of all floats of the law in place of `LAW`."""
+    """Return names of free parameters with those of all parameters of the law in place of `LAW`."""
     names = (names,) if isinstance(names, str) else names
     if not isinstance(names, tuple | list) or LAW not in names:
         return names
     own = tuple(law_fields(gas.law))
     if not own:
         raise ValueError(
-            f'free="law", but the law {type(gas.law).__name__} has no floats. Declare its numbers '
-            "as fields of the type float, its arrays as jax.Array"
+            f'free="law", but the law {type(gas.law).__name__} has no parameters. Declare its '
+            "numbers as fields of the type float, its arrays as jax.Array"
         )
     parts = [own if name == LAW else (name,) for name in names]
     return tuple(dict.fromkeys(name for part in parts for name in part))
 
 
-def with_floats(gas: Gas, values: dict[str, Any]) -> Gas:
-    """Return a gas with new values of some floats, of any type of array; ranges are not checked."""
+def with_parameters(gas: Gas, values: dict[str, Any]) -> Gas:
+    """Return a gas with new parameters, of any type of array; ranges are not checked."""
     if not values:
         return gas
-    fields = gas._float_fields
+    fields = gas._parameter_fields
     leaves, structure = jax.tree.flatten(gas)
     positions = structure.unflatten(range(len(leaves)))
     for name, value in values.items():
@@ -82,7 +82,7 @@ class Unknown(NamedTuple):
     """A parameter that a search varies.
 
     Attributes:
-        name: of a float of the gas, `START_TIME`, or of a nuisance parameter.
+        name: of a parameter of the gas, `START_TIME`, or of a nuisance parameter.
         label: of the measurement that it belongs to; None if all share it.
         shape: of its value.
         domain: its range, which gives its unconstrained scale.
@@ -133,9 +133,9 @@ def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
         weight = 1 / line
         slope = np.sum(weight**2 * (line - origin) * times) / np.sum((weight * times) ** 2)
     rate = np.maximum(slope / origin, 1e-9 / times[-1])
-    values |= _guess_law(with_floats(gas, as_floats(values)), rate, free)
+    values |= _guess_law(with_parameters(gas, as_floats(values)), rate, free)
     values |= _guess_elements(gas, curve, free)
-    return with_floats(gas, as_floats({name: x for name, x in values.items() if name in free}))
+    return with_parameters(gas, as_floats({name: x for name, x in values.items() if name in free}))
 
 
 def guess_from_drops(gas: Gas, test: DropTest, free: tuple[str, ...]) -> dict[str, Any]:
@@ -279,7 +279,7 @@ def _intercept_and_slope(times: np.ndarray, line: np.ndarray) -> tuple[Any, Any]
 
 
 def _guess_elements(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> dict[str, Any]:
-    """Guess free floats of the elements that are at an end of their range.
+    """Guess free parameters of the elements that are at an end of their range.
 
     A fit in an unconstrained scale cannot start there. The guess of beta_t is 0, that of T_rot at
     t = 0 the first measured one or a tenth of T_0, and that of a drag rate a tenth of the mean
@@ -309,7 +309,7 @@ def _guess_elements(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> dic
 
 
 def extra_parameters(priors: Priors, free: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the floats that vary because of a prior and are not free parameters."""
+    """Return the parameters that vary because of a prior and are not free parameters."""
     varied = ("mass" if name == DENSITY else name for name in priors if name != SMOOTHNESS)
     return tuple(dict.fromkeys(name for name in varied if name not in free))
 
@@ -324,7 +324,7 @@ def prior_residuals(
 
     Args:
         priors: the known values.
-        gas: the scene, for floats that are not varied.
+        gas: the scene, for parameters that are not varied.
         values: SI values of the parameters that are varied, by name.
     """
     rows = {}
@@ -363,13 +363,13 @@ def _law_prior(gas: Gas) -> Array:
 
 @eqx.filter_jit
 def residuals_and_slopes(
-    residuals_of: Callable[[Gas], Array], gas: Gas, floats: dict[str, Array]
+    residuals_of: Callable[[Gas], Array], gas: Gas, parameters: dict[str, Array]
 ) -> tuple[Array, dict[str, Array]]:
-    """Return residuals of a gas, and their derivatives in some floats, shape (n, size), by name."""
+    """Return residuals of a gas, and their derivatives, shape (n, size), by name of parameter."""
 
-    def residuals(floats: dict[str, Array]) -> tuple[Array, Array]:
-        values = residuals_of(with_floats(gas, floats))
+    def residuals(parameters: dict[str, Array]) -> tuple[Array, Array]:
+        values = residuals_of(with_parameters(gas, parameters))
         return values, values
 
-    slopes, values = jax.jacfwd(residuals, has_aux=True)(floats)
+    slopes, values = jax.jacfwd(residuals, has_aux=True)(parameters)
     return values, {name: slope.reshape(values.size, -1) for name, slope in slopes.items()}

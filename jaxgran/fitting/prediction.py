@@ -19,7 +19,7 @@ from jaxtyping import Float
 from jaxgran._utils.tracing import fast_compilation
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.likelihood import Nodes, filtered, innovations
-from jaxgran.fitting.parameters import as_floats, power_of_line, with_floats
+from jaxgran.fitting.parameters import as_floats, power_of_line, with_parameters
 from jaxgran.fitting.rows import (
     CALIBRATION,
     DISPLACEMENT,
@@ -213,7 +213,9 @@ class PredictedCurve:
         compared[:, 0] = np.log(T + floor)
         gases = steps.shape[1]
         gas = jax.tree.map(lambda x: np.broadcast_to(x, (gases, *np.shape(x))), self.gas)
-        gas = with_floats(gas, {name: np.moveaxis(x, -1, 0) for name, x in batch.floats.items()})
+        gas = with_parameters(
+            gas, {name: np.moveaxis(x, -1, 0) for name, x in batch.floats.items()}
+        )
         nodes = Nodes(
             self.times,
             batch.log_T,
@@ -331,7 +333,7 @@ def predicted_curve(
     """
     names = values.keys() & rows.gas.domains.keys()
     floats = as_floats({name: values[name] for name in names})
-    gas = with_floats(rows.gas, floats)
+    gas = with_parameters(rows.gas, floats)
     elapsed = np.asarray(rows.curve.times) - float(values.get(START_TIME, 0.0))
     elapsed = elapsed * rows.faster
     times, place = times_with_nodes(np.abs(elapsed), rows.unit_time)

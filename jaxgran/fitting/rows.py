@@ -14,9 +14,9 @@ from jaxgran._utils.validation import float_array
 from jaxgran.data.curve import NOISE, CoolingCurve
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import Measurement
-from jaxgran.fitting.parameters import with_floats
+from jaxgran.fitting.parameters import with_parameters
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.choose import error_model_along
+from jaxgran.models.choose import error_model_of_curve
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.linearise import (
     curve_of_program,
@@ -255,14 +255,14 @@ class DropRows:
         """Return the factor by which eps that scatters from impact to impact widens each error.
 
         Args:
-            values: of floats of the gas, by name; "spread" is the scatter of eps. Without it the
+            values: parameters of the gas, by name; "spread" is the scatter of eps. Without it the
                 most likely scatter is taken where eps scatters (`DropTest.scatters`).
             residuals: measured minus computed values, over their errors.
         """
         factors = np.ones(self.data.num_values)
         if "spread" not in values and not self.data.scatters:
             return factors
-        errors = np.asarray(self.data.errors(with_floats(self.gas, values)))
+        errors = np.asarray(self.data.errors(with_parameters(self.gas, values)))
         spread = float(values.get("spread", 0.0))
         if "spread" not in values:
             spread = most_likely_scatter(residuals[: errors.size], errors)
@@ -498,7 +498,7 @@ def with_rate_error(rows: CurveRows, model: AbstractModel, gas: Gas) -> CurveRow
     curve = curve_of_program(exact, gas, times, rows.displacement is not None)
     if not np.all(np.isfinite(np.asarray(curve.temperature))):
         return rows
-    error_model = error_model_along(gas, curve, rows.measurement.num_particles)
+    error_model = error_model_of_curve(gas, curve, rows.measurement.num_particles)
     error = np.broadcast_to(model.rate_error(error_model), times.shape)
     return replace(rows, rate_error=(times, np.asarray(error, float)))
 

@@ -14,7 +14,7 @@ from jaxgran.fitting.parameters import (
     guess_from_drops,
     guess_start_time,
     known_start_time,
-    with_floats,
+    with_parameters,
 )
 from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.rows import CurveRows, DropRows, curve_rows, with_rate_error
@@ -108,7 +108,7 @@ def problem_with_rate_errors(problem: Problem, flat: np.ndarray) -> Problem:
         if isinstance(m, DropRows):
             return m
         own = {n: x for n, x in values[m.label].items() if n in m.scene.domains}
-        return with_rate_error(m, problem.model, with_floats(m.scene, as_floats(own)))
+        return with_rate_error(m, problem.model, with_parameters(m.scene, as_floats(own)))
 
     return replace(problem, measurements=tuple(map(with_error, problem.measurements)))
 
@@ -121,7 +121,7 @@ def with_values_of(gas: Gas, other: Gas, names: tuple[str, ...]) -> Gas:
 
 def _values_of_guesses(problem: Problem, guesses: dict[str, Gas]) -> dict[str, dict[str, Any]]:
     """Return the values of gases and a guess of t0, by label and name."""
-    values: dict[str, dict[str, Any]] = {label: gas.floats for label, gas in guesses.items()}
+    values: dict[str, dict[str, Any]] = {label: gas.parameters for label, gas in guesses.items()}
     for m in problem.curves:
         names = tuple(u.name for u in problem.unknowns if u.label in (None, m.label))
         known = known_start_time(problem.priors, m.label)

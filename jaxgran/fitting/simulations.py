@@ -44,7 +44,7 @@ from jaxgran.fitting.parameters import (
     as_floats,
     extra_parameters,
     prior_residuals,
-    with_floats,
+    with_parameters,
 )
 from jaxgran.fitting.prediction import PredictedCurve, Residuals, predicted_curve
 from jaxgran.fitting.problem import Problem, summed
@@ -58,7 +58,7 @@ from jaxgran.fitting.setup import (
     with_values_of,
 )
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.choose import error_model_along
+from jaxgran.models.choose import error_model_of_curve
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.linearise import linearise, with_neutral_elements
 from jaxgran.scene.gas import Gas
@@ -154,7 +154,7 @@ class Simulations:
 
     def gas_at(self, flat: Any) -> Gas:
         """Return the gas at some parameters, which may be traced."""
-        return with_floats(self.rows.scene, self.problem.values(flat)[""])
+        return with_parameters(self.rows.scene, self.problem.values(flat)[""])
 
     def curve_at(self, flat: Any, number: int) -> CoolingCurve:
         """Return the curve of a simulation; `number` differs between simulations."""
@@ -300,7 +300,7 @@ def fit_through_simulations(
     problem = Problem.build((replace(rows, gas=gas),), model, request.names, (), {})
     problem = replace(problem, unknowns=problem.unknowns[: len(request.names)])
     problem.check_points()
-    first = problem.flat({"": guess.floats})
+    first = problem.flat({"": guess.parameters})
     if not np.all(np.isfinite(first)):
         at = ", ".join(f"{name} = {guess.value(name)}" for name in request.names)
         raise ValueError(
@@ -451,7 +451,7 @@ def _result(
     if prior_rows.size:
         covariances[SMOOTHNESS] = to_si @ prior_rows.T @ prior_rows @ to_si.T
     priors = {k: x for k, x in request.priors.get("", {}).items() if k != SMOOTHNESS}
-    gas = with_floats(sims.rows.scene, as_jax_arrays(as_floats(problem.values(flat)[""])))
+    gas = with_parameters(sims.rows.scene, as_jax_arrays(as_floats(problem.values(flat)[""])))
     for name, change in prior_effects(gas, priors, search.curve, sims.rows.uses_rotation).items():
         moved = to_si @ sensitivity.T @ (curve.whiten(change) / ratio**0.5)
         covariances[name] = moved @ moved.T
@@ -528,7 +528,7 @@ def _smoothness_rows(problem: Problem, flat: np.ndarray) -> np.ndarray:
     gas = problem.measurements[0].scene
 
     def prior(flat: Array) -> Array:
-        return with_floats(gas, problem.values(flat)[""]).law.prior_residuals()
+        return with_parameters(gas, problem.values(flat)[""]).law.prior_residuals()
 
     if not gas.law.prior_residuals().size:
         return np.zeros((0, flat.size))
@@ -568,7 +568,7 @@ def derivative_bias(sims: Simulations, search: Search, gas: Gas, sensitivity: np
     bias = curve.derivative_bias
     if bias is None:
         N = getattr(sims.model, "num_particles", None)
-        error_model = error_model_along(gas, _from_start(gas, curve), N)
+        error_model = error_model_of_curve(gas, _from_start(gas, curve), N)
         whole = np.broadcast_to(sims.model.derivative_error(error_model), error_model.time.shape)
         bias = whole[-curve.times.size :]
     weights = np.sum(sensitivity[: curve.times.size] ** 2, axis=1)
@@ -582,7 +582,7 @@ def _from_start(gas: Gas, curve: CoolingCurve) -> CoolingCurve:
     known = {name: getattr(curve, name) for name in names if getattr(curve, name) is not None}
     known |= {"times": curve.times, "status": np.zeros((), int)}
     if float(curve.times[0]) > 0:
-        firsts = {name: gas.floats.get(name, 0.0) for name in known if name != "status"}
+        firsts = {name: gas.parameters.get(name, 0.0) for name in known if name != "status"}
         known |= {name: np.append(np.asarray(first), known[name]) for name, first in firsts.items()}
     return CoolingCurve(**as_jax_arrays(known))
 

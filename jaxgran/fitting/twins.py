@@ -17,7 +17,7 @@ from jaxgran.fitting.alternatives import (
     Alternative,
     side_of_walls,
 )
-from jaxgran.fitting.parameters import as_floats, halving_time, with_floats
+from jaxgran.fitting.parameters import as_floats, halving_time, with_parameters
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.rows import finite_size_cooling_factor, times_with_nodes
 from jaxgran.models.kinetic_theory import KineticTheory
@@ -61,7 +61,7 @@ class Truth:
         if "diameter" in values:
             values["mass"] = gas.mass * (values["diameter"] / gas.diameter) ** 3
         added = {name: x for name, x in self.elements.items() if getattr(gas, name) is None}
-        return replace(with_floats(gas, as_jax_arrays(as_floats(values))), **added)
+        return replace(with_parameters(gas, as_jax_arrays(as_floats(values))), **added)
 
 
 AS_GIVEN = Truth("as given")

@@ -50,7 +50,7 @@ def by_differences(
         if not any(len(leaf) for leaf in jax.tree.leaves(directions)):
             return run(scene, times, start, others, none)  # only times or the density change
         material = scene.material
-        slope = jax.vmap(lambda along: jax.jvp(scene.log_loss, (material,), (along,))[1])(
+        slope = jax.vmap(lambda tangent: jax.jvp(scene.log_loss, (material,), (tangent,))[1])(
             directions
         )
         if not any_traced(slope) and not bool(jnp.all(jnp.isfinite(slope))):
@@ -64,7 +64,7 @@ def by_differences(
         sizes = jnp.where(known[:, None], signs[None] / jnp.where(known, slope, 1.0)[:, None], 0.0)
 
         def moved(size: Array, direction: Any) -> Any:
-            return jax.tree.map(lambda number, along: number + size * along, material, direction)
+            return jax.tree.map(lambda x, tangent: x + size * tangent, material, direction)
 
         materials = jax.vmap(jax.vmap(moved, (0, None)))(sizes, directions)
         losses = jax.vmap(jax.vmap(scene.log_loss))(materials)

@@ -115,10 +115,10 @@ def differentiable(
         known = {}
         for name, rate in records.rates.items():
             power = BY_DENSITY.get(name, 0.0)
-            by_clock = rate * time_change[:, None]
+            by_delay = rate * time_change[:, None]
             by_density = power * density_change * records.values[name]
-            along = jnp.einsum("tpr,p->tr", records.tangents[name], amounts)
-            known[name] = by_clock + by_density + along
+            by_material = jnp.einsum("tpr,p->tr", records.tangents[name], amounts)
+            known[name] = by_delay + by_density + by_material
         plain = found._replace(records=records._replace(rates={}, tangents={}))
         changes = amounts, density_change, time_change
         unknown = jax.tree.map(lambda x: nan_tangent(x, *changes), plain)

@@ -107,7 +107,7 @@ class ContactTangents(NamedTuple):
     Attributes:
         directions: in the material, a pytree like it, stacked along a first axis.
         log_temperature: c = d ln T.
-        clock: tangent of the time at a fixed place in the sequence of collisions.
+        delay: tangent of the time at a fixed place in the sequence of collisions.
         position: tangent of the positions.
         velocity: tangent of the velocities, without the part (c/2) v.
         free: True for spheres that touch no other one.
@@ -118,7 +118,7 @@ class ContactTangents(NamedTuple):
 
     directions: Any
     log_temperature: Float[Array, "p replicas"]
-    clock: Float[Array, "p replicas"]
+    delay: Float[Array, "p replicas"]
     position: Float[Array, "p n d"]
     velocity: Float[Array, "p n d"]
     free: Bool[Array, "n"]
@@ -149,7 +149,7 @@ class ContactTangents(NamedTuple):
         return cls(
             directions=directions,
             log_temperature=zeros,
-            clock=zeros,
+            delay=zeros,
             position=particle_zeros,
             velocity=particle_zeros,
             free=jnp.ones(len(velocity), bool),
@@ -184,7 +184,7 @@ class ContactTangents(NamedTuple):
         rest = self.velocity - 0.5 * of_particles(gain) * velocity[None]
         return self._replace(
             log_temperature=c + gain,
-            clock=self.clock - 0.5 * (c + 0.5 * gain) * self.elapsed,
+            delay=self.delay - 0.5 * (c + 0.5 * gain) * self.elapsed,
             position=jnp.where(free[None], 0.0, self.position),
             velocity=jnp.where(free[None], 0.0, rest),
             elapsed=jnp.zeros_like(self.elapsed),

@@ -46,7 +46,7 @@ class AbstractModel(eqx.Module):
 
     >>> jaxgran.KineticTheory().name, jaxgran.DSMC(1000).stochastic
     ('kinetic theory', True)
-    >>> isinstance(jaxgran.HardSpheres(100), jaxgran.AbstractModel)
+    >>> isinstance(jaxgran.HardSpheres(100), jaxgran.extend.AbstractModel)
     True
     """
 
@@ -98,24 +98,29 @@ class AbstractModel(eqx.Module):
         """
         return self.simulate(gas, times, Run())
 
-    def solve_along(
-        self, gas: Gas, times: Float[Array, "times"], tolerance: Any, gas_along: Gas, delay: Any
+    def solve_with_tangents(
+        self,
+        gas: Gas,
+        times: Float[Array, "times"],
+        tolerance: Any,
+        gas_tangents: Gas,
+        shift_tangents: Any,
     ) -> tuple[CoolingCurve, CoolingCurve]:
         """Return the curve of `solve`, and its derivatives along some directions.
 
         Args:
             gas, times, tolerance: as of `solve`.
-            gas_along: tangents of the gas, with a first axis (directions,).
-            delay: tangents of a shift of all times, shape (directions,).
+            gas_tangents: tangents of the gas, with a first axis (directions,).
+            shift_tangents: tangents of a shift of all times, shape (directions,).
         """
 
         def curve(gas: Gas, shift: Array) -> CoolingCurve:
             return self.solve(gas, times + shift, tolerance)
 
-        def along(gas_along: Gas, delay: Array) -> tuple[CoolingCurve, CoolingCurve]:
-            return jax.jvp(curve, (gas, jnp.zeros((), times.dtype)), (gas_along, delay))
+        def with_tangents(*tangents: Any) -> tuple[CoolingCurve, CoolingCurve]:
+            return jax.jvp(curve, (gas, jnp.zeros((), times.dtype)), tangents)
 
-        return jax.vmap(along, out_axes=(None, 0))(gas_along, delay)
+        return jax.vmap(with_tangents, out_axes=(None, 0))(gas_tangents, shift_tangents)
 
     def simplified_for(self, *gases: Gas, displacement: bool = False) -> "AbstractModel":
         """Return the model that computes the curves of some gases in fits: by default this one.
@@ -203,10 +208,10 @@ class AbstractModel(eqx.Module):
         """
 
     def check_fit(self, names: tuple[str, ...]) -> None:
-        """Check that the named floats of a gas can be fitted through this model (default: all).
+        """Check that the named parameters of a gas can be fitted through this model (default: all).
 
         Raises:
-            ValueError: naming the floats that cannot be fitted, with the reason.
+            ValueError: naming the parameters that cannot be fitted, with the reason.
         """
 
     def rotation_accuracy(self, gas: Gas) -> float:

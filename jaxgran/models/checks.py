@@ -42,7 +42,7 @@ def checked_gas(gas: Any) -> Gas:
     if not isinstance(gas, Gas):
         raise ValueError(f"gas must be a jaxgran.Gas, got {type(gas).__name__}")
     gas.check_single()
-    for name, value in gas.floats.items():  # changed by equinox.tree_at, they were not checked
+    for name, value in gas.parameters.items():  # changed by equinox.tree_at, they were not checked
         gas.domains[name].check(name, value)
     return gas
 
@@ -116,8 +116,8 @@ def check_softness_at(gas: Gas, speed: float, softness: float) -> None:
         place = "T_0" if speed == 1 else f"{speed**2:.3g} T_0, to which the gas heats up"
         raise ValueError(
             f"spheres overlap by {overlap:.2g} diameters at {place}, where the softness "
-            "correction is invalid. Check that youngs_modulus is in Pa, or use SoftSpheres or "
-            "KineticTheory(softness=False)."
+            "correction is invalid. Check that youngs_modulus is in Pa, use SoftSpheres, or leave "
+            '"softness" out of the corrections of KineticTheory.'
         )
 
 
@@ -262,8 +262,9 @@ def valid_where_traced(
     """Replace a gas and times whose traced values are out of range by ones that models accept.
 
     Returns:
-        The gas, nan where a traced float is out of range; the times, replaced if traced ones do not
-        increase from 0 or later; and True if all values were allowed, None if nothing is traced.
+        The gas, nan where a traced parameter is out of range; the times, replaced if traced ones do
+        not increase from 0 or later; and True if all values were allowed, None if nothing is
+        traced.
     """
     if not any_traced(gas, times):
         return gas, times, None

@@ -36,6 +36,34 @@ NUM_PARTICLES = 4000
 NUM_TIMES = 64
 """Number of times at which an `ErrorModel` samples the cooling gas."""
 
+REASONS = {
+    # the first one
+    "chosen": "{name}: the cheapest model whose estimated error of T, {error}, is within "
+    "{tolerance}.",
+    "no model": "{name}: the most accurate model, with an estimated error of T of {error}; no "
+    "model is within {tolerance}.",
+    "more particles": " More particles or replicas reduce the noise.",
+    # the scene
+    "falls": "T falls to {lowest:.2g} T_0 in {collisions:.3g} collisions per particle.",
+    "rises": "T rises to {end:.2g} T_0 in {collisions:.3g} collisions per particle.",
+    "contacts": "Contacts last {duration} of the mean free time and overlap by {overlap} of a "
+    "diameter: the error of T is {hard} with instantaneous impacts, {corrected} with kinetic "
+    "theory's first-order correction.",
+    "unknown box": "At a packing fraction of {phi:.2g} the error of kinetic theory is {error} if "
+    "the gas stays homogeneous; without num_particles the box is unknown, and clustering is not "
+    "estimated.",
+    "box": "At a packing fraction of {phi:.2g} in a box of {ratio:.2g} L_c, where the flow reaches "
+    "{flow} of the energy, the error of homogeneous models is {error}.{clusters} The box {walls}.",
+    "clusters": " Clusters follow the flow (see Gas.critical_box).",
+    "noise": "{number} particles have a noise of {noise} in T.",
+    "noise and flow": "{number} particles have a noise of {noise} in T, {both} with the random "
+    "amplitudes of the flow.",
+    "friction": "These estimates leave friction out.",
+    # models that do not support the scene
+    "refused": "{name}: {refusal}.",
+}
+"""Reasons and their parts by name, with places for values."""
+
 
 class Candidate(NamedTuple):
     """A model that was considered for a scene.
@@ -97,7 +125,7 @@ def choose_model(
     ``|d ln T/dt| int_0^t e dt'`` of T. Contributions to e(t) are Enskog's collision frequency,
     contacts that last and overlap, and, in a box of known size, the flow that grows in it:
     kinetic theory and DSMC count its energy as heat, which cools. Particle models have noise. Each
-    model estimates its own error (`jaxgran.AbstractModel.estimated_error`).
+    model estimates its own error (`jaxgran.extend.AbstractModel.estimated_error`).
 
     Args:
         gas: the scene.
@@ -145,11 +173,7 @@ def choose_model(
     reasons = [
         _verdict(best.model, error, tolerance, enough=bool(good)),
         *_describe_scene(error_model, size, replicas),
-        *(
-            f"{_capitalised(c.model.name)}: {c.refusal.rstrip('.')}."
-            for c in candidates
-            if c.refusal
-        ),
+        *(_refused(c.model, c.refusal) for c in candidates if c.refusal),
     ]
     return Choice(best.model, tuple(reasons), candidates, error)
 
@@ -163,19 +187,16 @@ def _candidate(model: AbstractModel, error_model: ErrorModel) -> Candidate:
 
 
 def _verdict(model: AbstractModel, error: float, tolerance: float, enough: bool) -> str:
-    name, share = _capitalised(model.name), _percent(error)
-    if enough:
-        return (
-            f"{name}: the cheapest model whose estimated error of T, {share}, is within "
-            f"{_percent(tolerance)}."
-        )
-    verdict = (
-        f"{name}: the most accurate model, with an estimated error of T of {share}; no model is "
-        f"within {_percent(tolerance)}."
+    verdict = REASONS["chosen" if enough else "no model"].format(
+        name=_capitalised(model.name), error=_percent(error), tolerance=_percent(tolerance)
     )
-    if model.stochastic:
-        verdict += " More particles or replicas reduce the noise."
+    if model.stochastic and not enough:
+        verdict += REASONS["more particles"]
     return verdict
+
+
+def _refused(model: AbstractModel, refusal: str) -> str:
+    return REASONS["refused"].format(name=_capitalised(model.name), refusal=refusal.rstrip("."))
 
 
 def error_model_of(gas: Gas, end: float, num_particles: int | None = None) -> ErrorModel:
@@ -189,7 +210,7 @@ def error_model_of(gas: Gas, end: float, num_particles: int | None = None) -> Er
     grid = np.linspace(0, np.log1p(end / mean_free_time), NUM_TIMES)
     known = dataclasses.replace(gas, surface=None) if "friction" in gas.elements else gas
     curve = curve_of_program(KineticTheory(), known, np.expm1(grid) * mean_free_time)
-    error_model = error_model_along(gas, curve, num_particles)
+    error_model = error_model_of_curve(gas, curve, num_particles)
     softest = int(np.argmax(error_model.softness))
     hottest = np.exp(error_model.log_temperature[softest] / 2)
     check_softness_at(gas, hottest, float(error_model.softness[softest]))
@@ -199,7 +220,7 @@ def error_model_of(gas: Gas, end: float, num_particles: int | None = None) -> Er
     return error_model
 
 
-def error_model_along(
+def error_model_of_curve(
     gas: Gas, curve: CoolingCurve, num_particles: int | None = None
 ) -> ErrorModel:
     """Build the error model of a gas from its cooling curve, which begins at t = 0.
@@ -230,46 +251,49 @@ def _describe_scene(error_model: ErrorModel, size: int, replicas: int) -> list[s
     corrected = error_model.error_of_temperature(error_model.corrected_contacts)
     lowest, end = np.exp([error_model.log_temperature.min(), error_model.log_temperature[-1]])
     heated = error_model.gas.drive is not None and end > 1
-    frictional = "friction" in error_model.gas.elements
-    friction = ["These estimates leave friction out."] if frictional else []
-    return [
-        f"T {f'rises to {end:.2g}' if heated else f'falls to {lowest:.2g}'} T_0 in "
-        f"{error_model.collisions[-1]:.3g} collisions per particle.",
-        f"Contacts last {_percent(error_model.contact_fraction.max())} of the mean free time and "
-        f"overlap by {_percent(error_model.overlap.max())} of a diameter: the error of T is "
-        f"{_percent(hard)} with instantaneous impacts, {_percent(corrected)} with kinetic theory's "
-        "first-order correction.",
+    reasons = [
+        REASONS["rises" if heated else "falls"].format(
+            lowest=lowest, end=end, collisions=error_model.collisions[-1]
+        ),
+        REASONS["contacts"].format(
+            duration=_percent(error_model.contact_fraction.max()),
+            overlap=_percent(error_model.overlap.max()),
+            hard=_percent(hard),
+            corrected=_percent(corrected),
+        ),
         _describe_box(error_model),
         _describe_noise(error_model, size, replicas),
-        *friction,
     ]
+    if "friction" in error_model.gas.elements:
+        reasons.append(REASONS["friction"])
+    return reasons
 
 
 def _describe_box(error_model: ErrorModel) -> str:
-    gas, error = error_model.gas, _percent(error_model.error_of_temperature(error_model.correlated))
-    text = f"At a packing fraction of {float(gas.packing_fraction):.2g}"
+    gas = error_model.gas
+    phi = float(gas.packing_fraction)
+    error = _percent(error_model.error_of_temperature(error_model.correlated))
     if error_model.num_particles is None:
-        return (
-            f"{text} the error of kinetic theory is {error} if the gas stays homogeneous; without "
-            "num_particles the box is unknown, and clustering is not estimated."
-        )
+        return REASONS["unknown box"].format(phi=phi, error=error)
     scales = scales_at(gas)
     side = scales.box_side(error_model.num_particles, gas.dimension)
     ratio = side / float(scales.critical_box)
-    later = " Clusters follow the flow (see Gas.critical_box)." if ratio > 1 else ""
-    return (
-        f"{text} in a box of {ratio:.2g} L_c, where the flow reaches "
-        f"{_percent(error_model.flow_share.max())} of the energy, the error of homogeneous models "
-        f"is {error}.{later} The box {describe_walls(gas, error_model.num_particles)}."
+    return REASONS["box"].format(
+        phi=phi,
+        ratio=ratio,
+        flow=_percent(error_model.flow_share.max()),
+        error=error,
+        clusters=REASONS["clusters"] if ratio > 1 else "",
+        walls=describe_walls(gas, error_model.num_particles),
     )
 
 
 def _describe_noise(error_model: ErrorModel, size: int, replicas: int) -> str:
-    noise, flowing = error_model.shot_noise(size * replicas), error_model.flow_noise(replicas)
-    text = f"{size * replicas} particles have a noise of {_percent(noise)} in T"
-    if flowing <= noise / 10:
-        return f"{text}."
-    return f"{text}, {_percent(hypot(noise, flowing))} with the random amplitudes of the flow."
+    noise = error_model.shot_noise(size * replicas)
+    flowing = error_model.flow_noise(replicas)
+    return REASONS["noise" if flowing <= noise / 10 else "noise and flow"].format(
+        number=size * replicas, noise=_percent(noise), both=_percent(hypot(noise, flowing))
+    )
 
 
 def _capitalised(text: str) -> str:

@@ -46,11 +46,11 @@ def cool(
     in both, but for rounding, which the ten collisions of its equilibration enlarge.
 
     Args:
-        gas: the scene; its floats may be traced, differentiated and batched with `jax.vmap`.
+        gas: the scene; its parameters may be traced, differentiated and batched with `jax.vmap`.
         times: t, s, increasing and >= 0, shape (times,); need not start at 0.
-        model: a `jaxgran.AbstractModel`, by default `jaxgran.KineticTheory()`. "auto" uses the
-            cheapest model whose estimated error is small enough; `jaxgran.choose_model` returns it
-            with the reasons.
+        model: a `jaxgran.extend.AbstractModel`, by default `jaxgran.KineticTheory()`. "auto" uses
+            the cheapest model whose estimated error is small enough; `jaxgran.choose_model` returns
+            it with the reasons.
         key: key of the random numbers of a particle model, by default `jax.random.key(0)`: two
             calls without a key return the same numbers. With several CPU devices, or from 8192
             spheres on with one, each replica has arrays of its own and the key

@@ -45,7 +45,7 @@ class DSMC(AbstractParticleModel):
     kicks at the beginning of each step and half at its end, on subsets of the particles in turn
     (`jaxgran.particles.dsmc.dynamics`).
 
-    Derivatives of T, T_rot and collisions are known in every float of the gas and in the times,
+    Derivatives of T, T_rot and collisions are known in every parameter of the gas and in the times,
     forward and reverse. The gas is assumed to remember its energies only, of translation and of
     rotation, whose tangents grow by what each collision, walls, drag and a drive exchange
     (`jaxgran.gradients.tangents`). The shape of the velocity distribution also depends on A, which

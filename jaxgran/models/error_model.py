@@ -117,7 +117,7 @@ Measured: hard spheres, N = 1000 (48 replicas) and 4000 (16), phi = .1 and .2, b
 to 5 mean free times: .6 to 1.1, .82 in the mean.
 """
 
-FLOW_OF_SLOPE = 3.0, 0.14
+SLOPE_BIAS_COEFFICIENTS = 3.0, 0.14
 """a, b of the relative error of a projected derivative of ln T in A, ``a c (1 + (c/b)^2)``.
 
 c is the relative error of the clock of a model that counts the flow of a run as heat.
@@ -134,7 +134,7 @@ errors.
 MEASURED_FLOW = 0.65
 """Ratio of the flow in the longest waves of a run to the predicted flow in all modes.
 
-Measured: .4 to .85 in the gases of `FLOW_OF_SLOPE`, increasing with time.
+Measured: .4 to .85 in the gases of `SLOPE_BIAS_COEFFICIENTS`, increasing with time.
 """
 
 MAX_WAVENUMBER_SQUARED = 4.0
@@ -305,12 +305,12 @@ class ErrorModel(NamedTuple):
 
 
 def slope_bias(clock: A) -> A:
-    """Return the relative error of a projected derivative: see `FLOW_OF_SLOPE`.
+    """Return the relative error of a projected derivative: see `SLOPE_BIAS_COEFFICIENTS`.
 
     Args:
         clock: relative error of the clock of a model that counts the flow as heat.
     """
-    factor, scale = FLOW_OF_SLOPE
+    factor, scale = SLOPE_BIAS_COEFFICIENTS
     return factor * clock * (1 + (clock / scale) ** 2)
 
 

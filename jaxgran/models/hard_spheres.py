@@ -15,7 +15,7 @@ from jaxgran.data.curve import Particles
 from jaxgran.models import checks
 from jaxgran.models.base import Limitation
 from jaxgran.models.error_model import ErrorModel
-from jaxgran.models.spheres import AbstractSpheres, Plan
+from jaxgran.models.spheres import AbstractSpheres, ArraySizes
 from jaxgran.particles.capacity import capacities
 from jaxgran.particles.hard.dynamics import (
     ALLOWED_OVERLAP,
@@ -73,9 +73,8 @@ class HardSpheres(AbstractSpheres):
             differences of whole runs (`jaxgran.gradients.differences`), 0.3 for most uses. They
             need two more runs for each number of the law and have noise, but no bias in a gas that
             clusters. None for projected derivatives.
-        plan: static sizes of arrays, see `sized_for`.
 
-    Derivatives of T, T_rot and collisions are known in every float of the gas and in the times,
+    Derivatives of T, T_rot and collisions are known in every parameter of the gas and in the times,
     forward and reverse, for any law; of smooth spheres also those of the dissipated energy. The gas
     is assumed to remember its energies only, of translation and of rotation, whose tangents grow by
     what each impact, walls, drag and a drive exchange (`jaxgran.gradients.tangents`). Compared with
@@ -109,7 +108,7 @@ class HardSpheres(AbstractSpheres):
     start: Particles | None = None
     neighbours: str = eqx.field(static=True, default="auto")
     differences: float | None = eqx.field(static=True, default=None)
-    plan: Plan | None = eqx.field(static=True, default=None)
+    _sizes: ArraySizes | None = eqx.field(static=True, default=None)
 
     listed_by_skin: ClassVar[float] = 7.0
     transforms_time: ClassVar[bool] = True
@@ -175,18 +174,18 @@ class HardSpheres(AbstractSpheres):
         return sphere_scene(gas, self.num_particles, material)
 
     def motion(
-        self, scene: SphereScene, shape: tuple[int, int, int], plan: Plan, engine: str
+        self, scene: SphereScene, shape: tuple[int, int, int], sizes: ArraySizes, engine: str
     ) -> HardDynamics:
         """Return the motion of the spheres."""
         return HardDynamics(
             scene=scene,
             shape=shape,
-            capacity=plan.capacity,
-            crowded=plan.equilibration_capacity,
+            capacity=sizes.capacity,
+            crowded=sizes.equilibration_capacity,
             listed_by_skin=self.listed_by_skin,
             engine=engine,
-            compiled_engine=plan.engine,
-            share=plan.steps,
+            compiled_engine=sizes.engine,
+            share=sizes.steps,
             contact_time=concrete_array(self.contact_time, scene.side.dtype),
             all_elastic=concrete_array(False),
         )
@@ -195,24 +194,24 @@ class HardSpheres(AbstractSpheres):
         """Return nothing: derivatives are known in all numbers."""
         return {}
 
-    def planned(
+    def needed_sizes(
         self, scene: SphereScene, dimension: int, replicas: int, spare: float | None = None
-    ) -> Plan:
+    ) -> ArraySizes:
         """Return static sizes; capacities were measured for phi = .001 to .4 (disks: .6) and
         N = 125 to 50 000."""
         d = dimension
         n = replicas * self.num_particles
-        around = self.neighbourhood(scene, d, replicas)
+        neighbours = self.neighbourhood(scene, d, replicas)
         share = max(WINDOW_SHARE, 2 * MIN_IMPACTS / n)
         fastest = SPEED_MARGIN * (0.5 + (2 * math.log(n)) ** 0.5)  # of Maxwell's n speeds
         longest = share if share == WINDOW_SHARE else SKIN_GROWTH * share
-        reach = 2 * fastest * longest / around.collision_frequency
-        packed = 0.9 + 0.45 * around.in_contact / 2 ** (d - 1)
-        near = packed * around.contact_value * around.in_contact * ((1 + reach) ** d - 1)
-        near = min(near, around.listed)
-        chosen = min((0.65 + 0.35 * near) * longest, around.listed)
-        expected = around.listed, near, chosen, 1.25 * longest
-        extra = 1.3 * max(around.in_contact - 0.4, 0.0)  # random positions have more near pairs
-        capacity, crowded = capacities(expected, around, spare or 1.15, extra, n)
+        reach = 2 * fastest * longest / neighbours.collision_frequency
+        packed = 0.9 + 0.45 * neighbours.in_contact / 2 ** (d - 1)
+        near = packed * neighbours.contact_value * neighbours.in_contact * ((1 + reach) ** d - 1)
+        near = min(near, neighbours.listed)
+        chosen = min((0.65 + 0.35 * near) * longest, neighbours.listed)
+        expected = neighbours.listed, near, chosen, 1.25 * longest
+        extra = 1.3 * max(neighbours.in_contact - 0.4, 0.0)  # random positions have more near pairs
+        capacity, crowded = capacities(expected, neighbours, spare or 1.15, extra, n)
         made_for = tuple((k, getattr(self, k)) for k in ("num_particles", "replicas", "neighbours"))
-        return Plan(made_for, share, capacity, crowded, around.engine)
+        return ArraySizes(made_for, share, capacity, crowded, neighbours.engine)

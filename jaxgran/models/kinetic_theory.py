@@ -1,6 +1,7 @@
 """Kinetic theory of a homogeneous gas: seven ordinary differential equations."""
 
 import dataclasses
+from collections.abc import Collection, Iterable
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax
@@ -49,6 +50,24 @@ MAX_SEARCHED_SPREAD = 0.3
 SLIDING_ACCURACY = 0.2
 """Relative accuracy of T_rot/T of spheres that slide and rotated at t = 0, or have rough walls."""
 
+ALL_CORRECTIONS = ("correlations", "diffusion", "softness", "sonine", "spin_cumulants")
+"""Names of the corrections of `KineticTheory`."""
+
+
+def _checked_corrections(names: Any) -> tuple[str, ...]:
+    """Return names of corrections in alphabetical order.
+
+    Raises:
+        ValueError: for anything but a collection of names of `ALL_CORRECTIONS`.
+    """
+    given = [names] if isinstance(names, str) or not isinstance(names, Iterable) else [*names]
+    if isinstance(names, str) or any(name not in ALL_CORRECTIONS for name in given):
+        raise ValueError(
+            f"corrections must be a collection of some of {', '.join(ALL_CORRECTIONS)}, got "
+            f"{names!r:.60}. Leave it out for all; () is Enskog's theory of a Maxwellian gas."
+        )
+    return tuple(sorted(set(given)))
+
 
 class ReducedUnits(NamedTuple):
     """Units of `jaxgran.theory.averages` in SI: `Gas.path_length` and `Gas.impact_speed`."""
@@ -83,21 +102,19 @@ class KineticTheory(AbstractModel):
     1 : 1.2 and 1 : 1.4 and of diameters within 10 % is right within .6 %
     (``experiments/accuracy/size_statistics.py``).
 
-    The curve is differentiable in every float of the gas and in the times, forward and reverse.
+    The curve is differentiable in every parameter of the gas and in the times, forward and reverse.
     Second derivatives must be forward over forward or forward over reverse, as in `jax.hessian`,
     not ``jax.jacrev(jax.jacrev(...))``.
 
     Args:
-        sonine: solve for the Sonine coefficients; with False the gas stays Maxwellian.
+        corrections: names of what is added to Enskog's theory of a Maxwellian gas, by default all,
+            ``KineticTheory.all_corrections``: "sonine" (Sonine coefficients), "softness" (contacts
+            of finite duration, to first order), "correlations" (of velocities at finite density),
+            "spin_cumulants" (of rough spheres; otherwise spins and velocities stay independent and
+            Gaussian), "diffusion" (D and <dr^2>). To leave one out, give
+            ``KineticTheory.all_corrections - {"correlations"}``.
         order: 3 solves for a_2 and a_3, with D in the second Sonine order; 2 for a_2, with D in the
             first.
-        softness: apply the first-order corrections for contacts of finite duration (viscoelastic
-            spheres).
-        correlations: correct for velocity correlations at finite density; with False this is
-            Enskog's theory.
-        diffusion: solve for D and <dr^2>.
-        spin_cumulants: solve for the cumulants of spins of rough spheres; with False spins and
-            velocities stay independent and Gaussian.
         initial_sonine: a_2 at t = 0, in (-0.4, 1); that of `jaxgran.steady_state` for a gas that
             white noise has driven.
         rtol: relative tolerance of the adaptive solver; by default 1e-8 in float64, 1e-5 in
@@ -118,34 +135,27 @@ class KineticTheory(AbstractModel):
     (4,)
     """
 
-    sonine: bool = eqx.field(static=True, default=True)
+    corrections: Collection[str] = eqx.field(
+        static=True, converter=_checked_corrections, default=ALL_CORRECTIONS
+    )
     order: int = eqx.field(static=True, default=3)
-    softness: bool = eqx.field(static=True, default=True)
-    correlations: bool = eqx.field(static=True, default=True)
-    diffusion: bool = eqx.field(static=True, default=True)
-    spin_cumulants: bool = eqx.field(static=True, default=True)
     initial_sonine: float = eqx.field(static=True, default=0.0)
     rtol: float | None = eqx.field(static=True, default=None)
     solver: Any = eqx.field(static=True, default=diffrax.Tsit5(scan_kind="lax"))
     max_steps: int = eqx.field(static=True, default=200_000)
 
     def __check_init__(self):
-        validation.check_bool(
-            sonine=self.sonine,
-            softness=self.softness,
-            correlations=self.correlations,
-            diffusion=self.diffusion,
-            spin_cumulants=self.spin_cumulants,
-        )
         if self.order not in (2, 3) or isinstance(self.order, bool | float):
             raise ValueError(
-                f"order must be 2 or 3, got {self.order!r}. Use sonine=False for a Maxwellian gas."
+                f"order must be 2 or 3, got {self.order!r}. For a Maxwellian gas leave "
+                '"sonine" out of corrections.'
             )
         advice = "Initial a_2; 0 for a Maxwellian."
         validation.checked_float("initial_sonine", self.initial_sonine, SONINES, advice)
-        if self.initial_sonine and not self.sonine:
+        if self.initial_sonine and "sonine" not in self.corrections:
             raise ValueError(
-                f"initial_sonine = {self.initial_sonine} needs sonine=True: a_2 stays 0 otherwise."
+                f'initial_sonine = {self.initial_sonine} needs "sonine" among the corrections: '
+                "a_2 stays 0 otherwise."
             )
         if self.rtol is not None:
             validation.checked_float(
@@ -157,6 +167,7 @@ class KineticTheory(AbstractModel):
             )
         validation.checked_int("max_steps", self.max_steps, 1, "Leave it out for 200000.")
 
+    all_corrections: ClassVar[frozenset[str]] = frozenset(ALL_CORRECTIONS)
     stochastic: ClassVar[bool] = False
     elements: ClassVar[tuple[str, ...]] = SUPPORTED
     derivative_accuracy: ClassVar[float] = 0.015  # of dilute gases, phi = .05, by particle runs
@@ -172,7 +183,8 @@ class KineticTheory(AbstractModel):
         their distribution gets a long tail: T_rot/T is within 4 % (3D) and 20 % (2D) up to 100 mean
         free times, and half of the true one at 1000. Gaussian spins: 7 %.
         """
-        accuracy = {2: 0.05, 3: 0.03}[gas.dimension] if self.spin_cumulants else 0.07
+        exact = "spin_cumulants" in self.corrections
+        accuracy = {2: 0.05, 3: 0.03}[gas.dimension] if exact else 0.07
         accuracy = accuracy if gas.container is None else 0.15
         if gas.surface is None or gas.surface.friction is None:
             return accuracy
@@ -192,7 +204,8 @@ class KineticTheory(AbstractModel):
         if gas.container is not None or gas.diameter_sd is not None:
             return None
         correlation = 0.85 * np.minimum(gas.packing_fraction, 0.2)
-        sonine = 0.005 if self.order > 2 and self.sonine else {2: 0.024, 3: 0.017}[gas.dimension]
+        second = self.order > 2 and "sonine" in self.corrections
+        sonine = 0.005 if second else {2: 0.024, 3: 0.017}[gas.dimension]
         if gas.surface is not None:  # spins and velocities are correlated: DSMC, beta_t = .5
             sonine += 0.07
         return np.hypot(sonine, correlation)
@@ -271,8 +284,15 @@ class KineticTheory(AbstractModel):
         between = jnp.expm1(shares * jnp.log1p(frequency * times[-1])) / frequency
         grid = jnp.sort(jnp.concatenate([times, between]))
         curve, state = self._curve_and_moments(gas, grid, 1.0)
-        options = {"softness": self.softness, "correlations": self.correlations}
-        whole = run_covariance(gas, curve, state.spins, rotation=rotation, energy=energy, **options)
+        whole = run_covariance(
+            gas,
+            curve,
+            state.spins,
+            rotation=rotation,
+            energy=energy,
+            softness="softness" in self.corrections,
+            correlations="correlations" in self.corrections,
+        )
         rows = jnp.searchsorted(grid, times)
         if rotation:
             rows = jnp.concatenate([rows, rows + grid.size])
@@ -292,7 +312,7 @@ class KineticTheory(AbstractModel):
         gas.check_sizes()
         if any_traced(gas):
             return
-        if self.softness:
+        if "softness" in self.corrections:
             checks.check_softness(gas)
         checks.check_cools(gas)
 
@@ -306,8 +326,12 @@ class KineticTheory(AbstractModel):
         Contributions are correlations, contacts that last, walls, roughness, and Sonine terms
         beyond a_3.
         """
-        rate = error_model.correlated if self.correlations else error_model.homogeneous
-        contacts = error_model.corrected_contacts if self.softness else error_model.instant_contacts
+        rate = error_model.homogeneous
+        if "correlations" in self.corrections:
+            rate = error_model.correlated
+        contacts = error_model.instant_contacts
+        if "softness" in self.corrections:
+            contacts = error_model.corrected_contacts
         elements = error_model.mixing + error_model.roughness + error_model.sizes
         return rate + contacts + error_model.truncation(self.order) + elements
 
@@ -323,15 +347,15 @@ class KineticTheory(AbstractModel):
         Then only alternative explanations of their curves rotate. Gaussian spins change T by up to
         2 % there, and the program compiles in two thirds of the time.
         """
-        smooth = all(gas.surface is None for gas in gases)
-        return dataclasses.replace(
-            self,
-            spin_cumulants=self.spin_cumulants and not smooth,
-            diffusion=self.diffusion and displacement,
-        )
+        needed = set(self.corrections)
+        if all(gas.surface is None for gas in gases):
+            needed.discard("spin_cumulants")
+        if not displacement:
+            needed.discard("diffusion")
+        return dataclasses.replace(self, corrections=needed)
 
     def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
-        """Return the cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
+        """Return the cooling curve at the given times, s, as `AbstractModel.simulate` describes."""
         size = times.size
         padded = pad_to(times, padded_length(size))
         # Traced twice if it were compiled within another program.
@@ -361,35 +385,42 @@ class KineticTheory(AbstractModel):
         fault |= status.flag(status.UNSUPPORTED, ~sound)
         return self._curve(gas, units, times, moments, fault), moments
 
-    def solve_along(
-        self, gas: Gas, times: Float[Array, "times"], tolerance: Any, gas_along: Gas, delay: Any
+    def solve_with_tangents(
+        self,
+        gas: Gas,
+        times: Float[Array, "times"],
+        tolerance: Any,
+        gas_tangents: Gas,
+        shift_tangents: Any,
     ) -> tuple[CoolingCurve, CoolingCurve]:
         """Return `solve`, and its derivatives along some directions of the gas and of the times.
 
         Args:
             gas, times, tolerance: as of `solve`.
-            gas_along: tangents of the gas, with a first axis (directions,).
-            delay: tangents of a shift of all times, shape (directions,).
+            gas_tangents: tangents of the gas, with a first axis (directions,).
+            shift_tangents: tangents of a shift of all times, shape (directions,).
         """
-        times_along = jnp.broadcast_to(delay[:, None], (*delay.shape, times.size))
+        times_tangents = jnp.broadcast_to(
+            shift_tangents[:, None], (*shift_tangents.shape, times.size)
+        )
         sound = self._is_sound(gas)
 
         def each(function, *primals):
             """Return values, and derivatives along each direction."""
 
-            def along(*tangents):
+            def with_tangents(*tangents):
                 return jax.jvp(function, primals, tangents)
 
-            return jax.vmap(along, out_axes=(None, 0))
+            return jax.vmap(with_tangents, out_axes=(None, 0))
 
         def reduced(gas, times):
             return self._reduced(gas, times, sound)
 
-        values, tangents = each(reduced, gas, times)(gas_along, times_along)
+        values, tangents = each(reduced, gas, times)(gas_tangents, times_tangents)
         scene, at, units = values
-        scene_along, at_along, units_along = tangents
+        scene_tangents, at_tangents, units_tangents = tangents
         solver = self._solver(gas, times, tolerance)
-        state, state_along, fault = solver.moments_along(scene, at, scene_along, at_along)
+        state, state_tangents, fault = solver.moments_along(scene, at, scene_tangents, at_tangents)
         fault |= status.flag(status.UNSUPPORTED, ~sound)
 
         def curve(gas, units, times, state):
@@ -397,22 +428,26 @@ class KineticTheory(AbstractModel):
             return dataclasses.replace(whole, status=None)
 
         primals = gas, units, times, state
-        computed, along = each(curve, *primals)(gas_along, units_along, times_along, state_along)
-        return dataclasses.replace(computed, status=fault), along
+        computed, tangents = each(curve, *primals)(
+            gas_tangents, units_tangents, times_tangents, state_tangents
+        )
+        return dataclasses.replace(computed, status=fault), tangents
 
     def _reduced(
         self, gas: Gas, times: Float[Array, "times"], sound: Bool[Array, ""]
     ) -> tuple[SceneAndDensity, Float[Array, "times"], ReducedUnits]:
         """Return a gas and times in reduced units, and the units of length and speed."""
         units = ReducedUnits(gas.path_length, gas.impact_speed)
-        scene = reduced_scene(gas), Density.from_gas(gas, self.softness, self.correlations)
+        density = Density.from_gas(
+            gas, "softness" in self.corrections, "correlations" in self.corrections
+        )
         # A search may try a T_0 at which spheres are too soft: no step is made then.
         reduced = jnp.where(sound, times, 0.0) * units.speed / units.length
-        return scene, reduced, units
+        return (reduced_scene(gas), density), reduced, units
 
     def _is_sound(self, gas: Gas) -> Bool[Array, ""]:
         sound = jnp.asarray(True)
-        if self.softness:
+        if "softness" in self.corrections:
             law, hottest = gas.reduced_law, jnp.ones_like(gas.temperature)
             sound = softness_factor(law, hottest, gas.dimension) > 0
         if gas.diameter_sd is None:
@@ -422,13 +457,14 @@ class KineticTheory(AbstractModel):
 
     def _solver(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> MomentSolver:
         rtol = self.rtol or (1e-8 if times.dtype == jnp.float64 else 1e-5)
+        sonine = "sonine" in self.corrections
         equations = Equations(
             gas.dimension,
-            self.order if self.sonine else 2,
-            not self.sonine,
+            self.order if sonine else 2,
+            not sonine,
             self.initial_sonine,
-            not self.spin_cumulants,
-            self.diffusion and gas.diameter_sd is None,
+            "spin_cumulants" not in self.corrections,
+            "diffusion" in self.corrections and gas.diameter_sd is None,
             gas.diameter_sd is not None,
         )
         return MomentSolver(equations, self.solver, rtol * tolerance, self.max_steps)

@@ -85,7 +85,7 @@ def with_variant_law(gas: Gas) -> Gas:
     """Return a gas whose viscoelastic law has the floats of alternative laws, without effect."""
     if type(gas.law) is not Viscoelastic:
         return gas
-    return dataclasses.replace(gas, law=ViscoelasticVariant.of(gas.law))
+    return dataclasses.replace(gas, law=ViscoelasticVariant.from_law(gas.law))
 
 
 def linearise(
@@ -106,7 +106,7 @@ def linearise(
     """
     size = times.size
     padded = pad_to(times, grid_size(size))
-    sizes = {name: np.size(x) for name, x in gas.floats.items() if name in names}
+    sizes = {name: np.size(x) for name, x in gas.parameters.items() if name in names}
     directions, delay = _directions(gas, sizes)
     program = _compiled(jax.default_backend())
     computed = program(model, gas, padded, np.asarray(tolerance), directions, delay)
@@ -131,7 +131,7 @@ def _directions(gas: Gas, sizes: dict[str, int]) -> tuple[Gas, np.ndarray]:
     """
     count = max(4, 1 << sum(sizes.values()).bit_length())
     along = jax.tree.map(lambda x: np.zeros((count, *x.shape), x.dtype), gas)
-    fields = gas._float_fields
+    fields = gas._parameter_fields
     begin = 1
     for name, size in sizes.items():
         numbers = fields[name].get(along).reshape(count, size)
@@ -163,7 +163,7 @@ def _linearised(
     model: AbstractModel, gas: Gas, times: Array, tolerance: Array, gas_along: Gas, delay: Array
 ) -> tuple[dict[str, Array], dict[str, Array]]:
     """Values of a curve, and their derivatives along directions."""
-    curve, along = model.solve_along(gas, times, tolerance, gas_along, delay)
+    curve, along = model.solve_with_tangents(gas, times, tolerance, gas_along, delay)
     values = {name: getattr(curve, name) for name in COMPUTED}
     slopes = {name: getattr(along, name) for name in LINEARISED}
     return _known(values), _known(slopes)

@@ -86,7 +86,7 @@ class AbstractParticleModel(AbstractModel):
         """Estimate the bias of the derivatives of ln T from the flow in each replica."""
 
     def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
-        """Return the cooling curve at the given times, s; see `jaxgran.AbstractModel.simulate`."""
+        """Return the cooling curve at the given times, s, as `AbstractModel.simulate` describes."""
         invalid, fault = self.invalid_times(gas, times)
         if self.start is not None:  # then T_0 is a constant unit of speed in derivatives
             gas = gas.replace(temperature=jax.lax.stop_gradient(gas.temperature))

@@ -15,7 +15,7 @@ from jaxgran._utils.validation import POSITIVE, checked_float, python_int
 from jaxgran.data.curve import Particles
 from jaxgran.models.base import Limitation
 from jaxgran.models.error_model import ErrorModel
-from jaxgran.models.spheres import AbstractSpheres, Plan
+from jaxgran.models.spheres import AbstractSpheres, ArraySizes
 from jaxgran.particles.capacity import capacities, grid, round_up
 from jaxgran.particles.soft.dynamics import SoftDynamics
 from jaxgran.scene.contact import elastic_constant
@@ -97,7 +97,6 @@ class SoftSpheres(AbstractSpheres):
             differences of whole runs (`jaxgran.gradients.differences`), 0.3 for most uses. They
             need two more runs for each of A and alpha and have noise, but no bias in a gas that
             clusters. None for projected derivatives.
-        plan: static sizes of arrays, see `sized_for`.
 
     Derivatives of T, T_rot, collisions and the energies are known, forward and reverse: a gas
     depends on (alpha, A), its walls and drag, its collision frequency and the times only. The
@@ -126,7 +125,7 @@ class SoftSpheres(AbstractSpheres):
     neighbours: str = eqx.field(static=True, default="auto")
     projection: float | None = eqx.field(static=True, default=PROJECTION)
     differences: float | None = eqx.field(static=True, default=None)
-    plan: Plan | None = eqx.field(static=True, default=None)
+    _sizes: ArraySizes | None = eqx.field(static=True, default=None)
 
     listed_by_skin: ClassVar[float] = 3.0
     elements: ClassVar[tuple[str, ...]] = ("friction", "container", "drag")
@@ -236,30 +235,30 @@ class SoftSpheres(AbstractSpheres):
         return {FRICTION_REFUSED: friction, LENGTHS_REFUSED: lengths}
 
     def motion(
-        self, scene: SphereScene, shape: tuple[int, int, int], plan: Plan, engine: str
+        self, scene: SphereScene, shape: tuple[int, int, int], sizes: ArraySizes, engine: str
     ) -> SoftDynamics:
         """Return the motion of the spheres."""
         return SoftDynamics(
             scene=scene,
             shape=shape,
-            capacity=plan.capacity,
-            crowded=plan.equilibration_capacity,
+            capacity=sizes.capacity,
+            crowded=sizes.equilibration_capacity,
             listed_by_skin=self.listed_by_skin,
             engine=engine,
-            compiled_engine=plan.engine,
+            compiled_engine=sizes.engine,
             steps_per_contact=self.steps_per_contact,
-            steps_per_block=plan.steps,
+            steps_per_block=sizes.steps,
             projection=concrete_array(self.projection or np.inf, scene.side.dtype),
         )
 
-    def planned(
+    def needed_sizes(
         self, scene: SphereScene, dimension: int, replicas: int, spare: float | None = None
-    ) -> Plan:
+    ) -> ArraySizes:
         """Return static sizes; capacities were measured for phi = .01 to .4 (disks: .5) and
         t_c/tau_c = .003 to .3."""
         d = dimension
         n = replicas * self.num_particles
-        around = self.neighbourhood(scene, d, replicas)
+        neighbours = self.neighbourhood(scene, d, replicas)
         duration = round_up(float(scene.contact_duration), grid(n)[0])
         # A block lasts at most a contact, less if spheres fly far in that time.
         contacts_flown = MAX_SPEED * float(scene.contact_duration) / BLOCK_FLIGHT
@@ -267,16 +266,16 @@ class SoftSpheres(AbstractSpheres):
         steps = max(round(self.steps_per_contact / shorter), 8)
         block = steps / self.steps_per_contact
         flight = MAX_SPEED * duration * block
-        near = 0.75 * around.in_contact * around.contact_value * ((1 + 5 * flight) ** d - 1)
-        near = near * around.listed / (near + around.listed)
+        near = 0.75 * neighbours.in_contact * neighbours.contact_value * ((1 + 5 * flight) ** d - 1)
+        near = near * neighbours.listed / (near + neighbours.listed)
         # Contacts that exist or begin in a block, and the near pairs.
-        contact_fraction = duration * around.collision_frequency
+        contact_fraction = duration * neighbours.collision_frequency
         contact_fraction *= (1 + block) / 2
         touching = min(contact_fraction * (2.2 + 3 * near**2), near)
-        expected = around.listed, near, touching, 2 * touching / (1 + 1.6 * touching**0.6)
+        expected = neighbours.listed, near, touching, 2 * touching / (1 + 1.6 * touching**0.6)
         # At random positions the additional touching pairs are about those without correlation.
-        extra = 1.3 * around.in_contact
-        capacity, crowded = capacities(expected, around, spare or 1.2, extra, n)
+        extra = 1.3 * neighbours.in_contact
+        capacity, crowded = capacities(expected, neighbours, spare or 1.2, extra, n)
         names = "num_particles", "replicas", "neighbours", "steps_per_contact"
         made_for = tuple((name, getattr(self, name)) for name in names)
-        return Plan(made_for, steps, capacity, crowded, around.engine)
+        return ArraySizes(made_for, steps, capacity, crowded, neighbours.engine)

@@ -33,8 +33,8 @@ DIFFERENCE_STEPS = Domain(0.0, 0.5, high_allowed=True)
 S = TypeVar("S", bound="AbstractSpheres")
 
 
-class Plan(NamedTuple):
-    """Static sizes of a compiled run.
+class ArraySizes(NamedTuple):
+    """Static sizes of the arrays of a compiled run.
 
     Attributes:
         made_for: fields of the model, and their values, for which the sizes are made.
@@ -57,13 +57,12 @@ class AbstractSpheres(AbstractParticleModel):
     Attributes:
         neighbours: the search for pairs.
         differences: step of derivatives by differences; None for projected ones.
-        plan: static sizes from `sized_for`; None if they follow from the gas.
         listed_by_skin: pairs per particle that the skin adds to a neighbour list.
     """
 
     neighbours: AbstractVar[str]
     differences: AbstractVar[float | None]
-    plan: AbstractVar[Plan | None]
+    _sizes: AbstractVar[ArraySizes | None]
     listed_by_skin: AbstractClassVar[float]
 
     has_positions: ClassVar[bool] = True
@@ -74,21 +73,21 @@ class AbstractSpheres(AbstractParticleModel):
         """Return the gas in units of its diameter, mass and initial temperature."""
 
     @abstractmethod
-    def planned(
+    def needed_sizes(
         self, scene: SphereScene, dimension: int, replicas: int, spare: float | None = None
-    ) -> Plan:
+    ) -> ArraySizes:
         """Return static sizes for a scene of known numbers, with a spare factor on capacities."""
 
     @abstractmethod
     def motion(
-        self, scene: SphereScene, shape: tuple[int, int, int], plan: Plan, engine: str
+        self, scene: SphereScene, shape: tuple[int, int, int], sizes: ArraySizes, engine: str
     ) -> AbstractSphereDynamics:
         """Return the motion of the spheres.
 
         Args:
             scene: the gas in the units of the run.
             shape: number of replicas, of particles in each, and dimension.
-            plan: static sizes.
+            sizes: static sizes of its arrays.
             engine: search for pairs, see `jaxgran.particles.neighbours`.
         """
 
@@ -147,8 +146,8 @@ class AbstractSpheres(AbstractParticleModel):
         """
         checked_float("spare", spare, POSITIVE, "2 is twice the expected need.")
         self.check_scene(checks.checked_gas(gas))
-        plan = self.planned(self.scene(gas), gas.dimension, self.replicas, spare)
-        return dataclasses.replace(self, plan=plan)
+        sizes = self.needed_sizes(self.scene(gas), gas.dimension, self.replicas, spare)
+        return dataclasses.replace(self, _sizes=sizes)
 
     def units(self, gas: Gas) -> Units:
         """Return the diameter and the thermal speed as units."""
@@ -173,24 +172,24 @@ class AbstractSpheres(AbstractParticleModel):
     def dynamics(
         self, scene: SphereScene, dimension: int, replicas: int, traced: bool = False
     ) -> AbstractSphereDynamics:
-        """Return the motion of the spheres, with arrays of the planned sizes."""
-        plan = self._known_plan(scene, dimension, replicas)
-        engine = choose_engine(self.neighbours, plan.engine, traced)
+        """Return the motion of the spheres, with arrays of the sizes that it needs."""
+        sizes = self._known_sizes(scene, dimension, replicas)
+        engine = choose_engine(self.neighbours, sizes.engine, traced)
         if traced and engine == "jax-md":
             raise ValueError(
                 'inside jax.jit or jax.vmap neighbours="jax-md" is not supported, since it sizes '
                 "its cells from known numbers: leave neighbours out"
             )
-        return self.motion(scene, (replicas, self.num_particles, dimension), plan, engine)
+        return self.motion(scene, (replicas, self.num_particles, dimension), sizes, engine)
 
-    def _known_plan(self, scene: SphereScene, dimension: int, replicas: int) -> Plan:
-        """Return the plan of the model, or a new one if all numbers that it needs are known.
+    def _known_sizes(self, scene: SphereScene, dimension: int, replicas: int) -> ArraySizes:
+        """Return the sizes of the model, or new ones if all numbers that they need are known.
 
-        The plan of the model is for all its replicas in one array.
+        The sizes of the model are for all its replicas in one array.
         """
         name = type(self).__name__
-        if self.plan is not None:
-            for setting, planned in self.plan.made_for:
+        if self._sizes is not None:
+            for setting, planned in self._sizes.made_for:
                 value = getattr(self, setting)
                 if planned != value:
                     raise ValueError(
@@ -198,10 +197,10 @@ class AbstractSpheres(AbstractParticleModel):
                         f"{value!r}. Call sized_for(gas) again."
                     )
             if replicas == self.replicas:
-                return self.plan
+                return self._sizes
         try:
             with jax.ensure_compile_time_eval():
-                return self.planned(scene, dimension, replicas)
+                return self.needed_sizes(scene, dimension, replicas)
         except jax.errors.ConcretizationTypeError:
             raise ValueError(
                 "inside jax.jit the sizes of arrays must be known. Use "

@@ -266,13 +266,13 @@ def _pair_correlation(
 ) -> Float[Array, "bins"]:
     n, d = position.shape
 
-    def around(i: Array) -> Float[Array, "bins"]:
+    def distances_from(i: Array) -> Float[Array, "bins"]:
         apart = position - position[i][None]
         apart = apart - side * jnp.round(apart / side)
         distance = jnp.sqrt(jnp.sum(apart**2, axis=-1))
         return jnp.histogram(distance.at[i].set(jnp.inf), jnp.asarray(edges, distance.dtype))[0]
 
-    counts = jax.lax.map(around, jnp.arange(centres), batch_size=min(BATCH_SIZE, centres))
+    counts = jax.lax.map(distances_from, jnp.arange(centres), batch_size=min(BATCH_SIZE, centres))
     density = n / jnp.asarray(side) ** d
     g = jnp.sum(counts, axis=0) / (centres * density * shell_volumes(edges, d))
     # The tolerance allows for rounding of half a side.

@@ -31,7 +31,7 @@ def _number_or_none(name: str) -> Callable[[Any], Array | None]:
 
 
 class Element(eqx.Module):
-    """Base class of the elements, whose floats have ranges in `jaxgran.scene.parameters`."""
+    """Base class of the elements, whose parameters have ranges in `jaxgran.scene.parameters`."""
 
     part: ClassVar[str] = ""
     """End of the names of fields in messages, as " of the walls"."""

@@ -37,7 +37,7 @@ from jaxgran.scene.geometry import (
 )
 from jaxgran.scene.parameters import (
     ADVICE,
-    FLOAT_UNITS,
+    PARAMETER_UNITS,
     PREFIXES,
     domains_of,
     fields_of,
@@ -46,14 +46,14 @@ from jaxgran.scene.parameters import (
 )
 
 
-class FloatField(NamedTuple):
-    """Path to a float, of attributes (str) and items (tuples of one key), and its allowed range."""
+class ParameterField(NamedTuple):
+    """Path to a parameter, of attributes (str) and items (tuples of one key), and its range."""
 
     path: tuple[Any, ...]
     domain: Domain
 
     def get(self, module: Any) -> Any:
-        """Return the float of a module."""
+        """Return the parameter of a module."""
         for key in self.path:
             module = getattr(module, key) if isinstance(key, str) else module[key[0]]
         return module
@@ -80,18 +80,18 @@ def _without_function_leaf(leaf: Any) -> Any:
     return jax.tree_util.Partial(leaf) if callable(leaf) else leaf
 
 
-def law_fields(law: laws.RestitutionLaw) -> dict[str, FloatField]:
-    """Path and range of the floats of a law: those in its `domains`, then all further arrays.
+def law_fields(law: laws.RestitutionLaw) -> dict[str, ParameterField]:
+    """Path and range of the parameters of a law: those in its `domains`, then all further arrays.
 
     The name of an array in a part of the law is its path, "net.layers[0].weight".
     """
-    fields = {name: FloatField((name,), domain) for name, domain in law.domains.items()}
+    fields = {name: ParameterField((name,), domain) for name, domain in law.domains.items()}
     for keys, leaf in jax.tree_util.tree_flatten_with_path(law)[0]:
         name = jax.tree_util.keystr(keys).removeprefix(".")
         if name not in (*fields, *law.constants) and eqx.is_inexact_array(leaf):
             items = [(getattr(k, "idx", getattr(k, "key", None)),) for k in keys]
             path = [getattr(k, "name", item) for k, item in zip(keys, items, strict=True)]
-            fields[name] = FloatField(tuple(path), ANY)
+            fields[name] = ParameterField(tuple(path), ANY)
     return fields
 
 
@@ -130,7 +130,7 @@ def _optional_number(name: str) -> Any:
 class Gas(eqx.Module):
     """A homogeneous gas of spheres in its initial state.
 
-    Every float can be traced, differentiated and batched with `jax.vmap`.
+    Every parameter can be traced, differentiated and batched with `jax.vmap`.
 
     Args:
         law: law of restitution, such as `jaxgran.Viscoelastic`, `jaxgran.ConstantRestitution` or
@@ -189,7 +189,7 @@ class Gas(eqx.Module):
         if shared:
             raise ValueError(
                 f"the law {type(self.law).__name__} has a field {shared[0]!r}, which is also the "
-                "name of a float of the gas: rename it"
+                "name of a parameter of the gas: rename it"
             )
         for name in own:
             if getattr(self, name) is not None:
@@ -212,44 +212,44 @@ class Gas(eqx.Module):
             )
 
     def __getattr__(self, name: str) -> Any:
-        # Python calls this only for names that are not attributes, such as floats of parts.
-        if not name.startswith("_") and "law" in vars(self) and name in self._float_fields:
+        # Python calls this only for names that are not attributes, such as parameters of parts.
+        if not name.startswith("_") and "law" in vars(self) and name in self._parameter_fields:
             return self.value(name)
         raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
 
     @property
     def domains(self) -> dict[str, Domain]:
-        """Allowed range of every float, by name."""
-        return {name: field.domain for name, field in self._float_fields.items()}
+        """Allowed range of every parameter, by name."""
+        return {name: field.domain for name, field in self._parameter_fields.items()}
 
     @property
-    def floats(self) -> dict[str, Any]:
-        """Value of every float, by name: arrays of JAX, in fits also of NumPy."""
-        return {name: field.get(self) for name, field in self._float_fields.items()}
+    def parameters(self) -> dict[str, Any]:
+        """Value of every parameter, by name: arrays of JAX, in fits also of NumPy."""
+        return {name: field.get(self) for name, field in self._parameter_fields.items()}
 
     def value(self, name: str) -> Float[Array | np.ndarray, "..."]:
-        """Value of the float with this name.
+        """Value of the parameter with this name.
 
         Raises:
             ValueError: for an unknown name.
         """
-        fields = self._float_fields
+        fields = self._parameter_fields
         if name not in fields:
             raise ValueError(f"Gas has no parameter {name!r}; it has {', '.join(fields)}")
         return fields[name].get(self)
 
     def replace(self, **values: UserNumber) -> "Gas":
-        """Return a copy with new values of some floats.
+        """Return a copy with new values of some parameters.
 
         For example ``gas.replace(dissipative_constant=1e-6)``.
 
         Args:
-            values: new values, by name of the float.
+            values: new values, by name of the parameter.
 
         Raises:
             ValueError: for an unknown name or a value outside its range.
         """
-        fields = self._float_fields
+        fields = self._parameter_fields
         arrays = []
         for name, value in values.items():
             self.value(name)
@@ -261,20 +261,20 @@ class Gas(eqx.Module):
         )
 
     @cached_property
-    def _float_fields(self) -> dict[str, FloatField]:
+    def _parameter_fields(self) -> dict[str, ParameterField]:
         gas_domains = domains_of("Gas") | {"packing_fraction": _PACKING_DOMAINS[self.dimension]}
         if self.diameter_sd is None:
             del gas_domains["diameter_sd"]
         law = law_fields(self.law).items()
-        fields = {name: FloatField(("law", *path), domain) for name, (path, domain) in law}
-        fields |= {name: FloatField((name,), domain) for name, domain in gas_domains.items()}
+        fields = {name: ParameterField(("law", *path), domain) for name, (path, domain) in law}
+        fields |= {name: ParameterField((name,), domain) for name, domain in gas_domains.items()}
         parts: list[tuple[Any, Any]] = [((name,), getattr(self, name)) for name in ELEMENTS]
         if self.container is not None:
             parts.insert(2, (("container", "restitution"), self.container.restitution))
         for path, part in parts:
             prefix = PREFIXES.get(type(getattr(self, path[0])).__name__, "")
             for name, domain in ({} if part is None else part.domains).items():
-                fields[prefix + name] = FloatField((*path, name), domain)
+                fields[prefix + name] = ParameterField((*path, name), domain)
         return fields
 
     @property
@@ -289,7 +289,7 @@ class Gas(eqx.Module):
         """Check that this is one gas, not a batch of gases outside of `jax.vmap`.
 
         Raises:
-            ValueError: if a float has more than one value; the message names it.
+            ValueError: if a parameter has more than one value; the message names it.
         """
         if all(jnp.shape(leaf) == () for leaf in jax.tree.leaves(self)):
             return
@@ -308,7 +308,7 @@ class Gas(eqx.Module):
     def __repr__(self) -> str:
         parts = "".join(f", with {name}" for name in self.elements)
         title = f"Gas of {type(self.law).__name__} spheres, d = {self.dimension}{parts}"
-        units = [(name, FLOAT_UNITS.get(name, "")) for name in self.domains]
+        units = [(name, PARAMETER_UNITS.get(name, "")) for name in self.domains]
         rows = [(name, format_quantity(self.value(name), unit)) for name, unit in units]
         leaves = jax.tree.leaves(self)
         if any(isinstance(leaf, Tracer) or np.ndim(leaf) > 0 for leaf in leaves):

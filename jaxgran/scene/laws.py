@@ -44,12 +44,12 @@ class RestitutionLaw(eqx.Module):
     eps at normal approach speeds in m/s, and with a field for each number of the law, annotated
     ``float``, in any units that `restitution` understands. The fields become JAX arrays: they can
     be fitted, swept and differentiated by name. `domains` may give the allowed range of a field, as
-    in ``domains = {"yield_speed": jaxgran.Domain(0.0)}``; without it any finite number is allowed.
-    No field may have the name of a float of `jaxgran.Gas`. Kinetic theory needs an eps that is
-    smooth in the speed. If eps also depends on the diameter or the mass, override `reduced`
+    in ``domains = {"yield_speed": jaxgran.extend.Domain(0.0)}``; without it any finite number is
+    allowed. No field may have the name of a parameter of `jaxgran.Gas`. Kinetic theory needs an eps
+    that is smooth in the speed. If eps also depends on the diameter or the mass, override `reduced`
     instead.
 
-    >>> class Plastic(jaxgran.RestitutionLaw):
+    >>> class Plastic(jaxgran.extend.RestitutionLaw):
     ...     yield_speed: float  # m/s
     ...     def restitution(self, normal_speed):  # m/s
     ...         return (1 + (normal_speed / self.yield_speed) ** 2) ** -0.125
@@ -234,7 +234,7 @@ def check_reduced_units(law: RestitutionLaw) -> None:
             reduced = law.reduced(diameter=1e-3, mass=1e-6, speed=jnp.asarray(unit))
             if not isinstance(reduced, ReducedLaw):
                 raise ValueError(
-                    f"{cls.__name__}.reduced must return a jaxgran.ReducedLaw, got "
+                    f"{cls.__name__}.reduced must return a jaxgran.extend.ReducedLaw, got "
                     f"{type(reduced).__name__}; {_UNITS_ADVICE}"
                 )
             values.append(np.asarray(reduced.restitution(jnp.array([0.03, 0.3]) / unit), float))
@@ -502,7 +502,7 @@ class ViscoelasticVariant(Viscoelastic):
     }
 
     @classmethod
-    def of(cls, law: Viscoelastic) -> "ViscoelasticVariant":
+    def from_law(cls, law: Viscoelastic) -> "ViscoelasticVariant":
         """Return a variant that is a given law."""
         return cls(**{f.name: getattr(law, f.name) for f in dataclasses.fields(Viscoelastic)})
 

@@ -19,7 +19,7 @@ class Parameter(NamedTuple):
     """A number that describes a scene.
 
     Attributes:
-        name: of the float in `Gas`, as in ``gas.replace(wall_side=0.05)``.
+        name: of the parameter in `Gas`, as in ``gas.replace(wall_side=0.05)``.
         symbol: key of the header of a curve file and argument of --free; "" if it has none.
         unit: SI; "" for a number without one.
         domain: allowed values.
@@ -73,14 +73,14 @@ t0, the time at which the gas began to cool, and density, that of a solid sphere
 BY_SYMBOL = {p.symbol: p for p in PARAMETERS.values() if p.symbol}
 """Parameters that files and options name, by symbol."""
 
-FLOAT_UNITS = {p.name: p.unit for p in PARAMETERS.values() if p.unit}
+PARAMETER_UNITS = {p.name: p.unit for p in PARAMETERS.values() if p.unit}
 """Unit of each parameter that has one."""
 
 REQUIRED = ("eta", "diameter", "density", "Y", "nu", "T0")
 """Symbols that a curve file must give; eps, a constant restitution, may replace Y and nu."""
 
 PREFIXES = {"Walls": "wall_", "StokesDrag": "drag_", "WhiteNoise": "drive_"}
-"""Prefix of the names of the floats of an element in `Gas`, by class."""
+"""Prefix of the names of the parameters of an element in `Gas`, by class."""
 
 ADVICE = {
     "dissipative_constant": "Give A in seconds; A = 0 makes the spheres elastic.",
@@ -115,7 +115,7 @@ def symbol_of(name: str) -> str:
 
 def unit_of(name: str) -> str:
     """Return the unit of a parameter, which may begin with a label; "" if it has none."""
-    return FLOAT_UNITS.get(name.rpartition(": ")[2], "")
+    return PARAMETER_UNITS.get(name.rpartition(": ")[2], "")
 
 
 def number_named(name: str) -> Callable[[Any], Any]:

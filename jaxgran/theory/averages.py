@@ -64,13 +64,13 @@ def _impact_nodes(dimension: int) -> tuple[Float[np.ndarray, "nodes"], ...]:
     the tangential relative velocity; the scalar product of these two vectors; and weights with the
     sum 1.
     """
-    along, weight = np.polynomial.hermite_e.hermegauss(_NUM_NORMAL)
+    normal, weight = np.polynomial.hermite_e.hermegauss(_NUM_NORMAL)
     square, weight_of_square = scipy.special.roots_genlaguerre(_NUM_TANGENTIAL, (dimension - 3) / 2)
     if dimension == 2:
         cosine = np.array([-1.0, 1.0])
     else:
         cosine = np.cos((np.arange(_NUM_ANGLES) + 0.5) * pi / _NUM_ANGLES)
-    n, u, w, c = np.meshgrid(along / 2, square / 2, 2 * square, cosine, indexing="ij")
+    n, u, w, c = np.meshgrid(normal / 2, square / 2, 2 * square, cosine, indexing="ij")
     weights = np.einsum("a,b,c->abc", weight, weight_of_square, weight_of_square)
     weights = np.repeat(weights[..., None], cosine.size, axis=-1)
     values = (n, u, w, np.sqrt(u * w) * c, weights / weights.sum())
@@ -501,11 +501,11 @@ class RateTable(eqx.Module):
             last, before = row + 2 * x * last - before, last
         return self.coefficients[0] + x * last - before
 
-    def with_slopes(self, along: Float[Array, "directions nodes rows terms"]) -> "RateTable":
+    def with_slopes(self, slopes: Float[Array, "directions nodes rows terms"]) -> "RateTable":
         """Return the function, its slope and its derivatives as one function of ln(T/T_0).
 
         Args:
-            along: coefficients of the derivatives of the function in some directions.
+            slopes: coefficients of the derivatives of the function in some directions.
 
         Returns:
             A table of shape (2 + directions, rows, terms) at each temperature: the function, its
@@ -515,7 +515,7 @@ class RateTable(eqx.Module):
         width = self.highest - self.lowest
         slope = jnp.tensordot(derivative, self.coefficients, 1) * 2 / width
         both = jnp.stack([self.coefficients, slope], axis=1)
-        derivatives = jnp.moveaxis(along, 0, 1)
+        derivatives = jnp.moveaxis(slopes, 0, 1)
         return RateTable(jnp.concatenate([both, derivatives], 1), self.lowest, self.highest)
 
 

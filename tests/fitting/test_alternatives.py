@@ -97,8 +97,8 @@ def test_gravity_is_said_to_be_taken_as_absent_between_walls():
         assert found == (gas is between)
 
 
-EDGE = jaxgran.Limitation("the gas is dense", False, "Take positions.")
-DECISIVE = jaxgran.Limitation("contacts last", True, "Take contacts.")
+EDGE = jaxgran.extend.Limitation("the gas is dense", False, "Take positions.")
+DECISIVE = jaxgran.extend.Limitation("contacts last", True, "Take contacts.")
 CONSISTENT = " is consistent with this curve"
 AT_EDGE = ".* The scene is at the edge of the model's validity."
 NOT_EXPLAINED = " is not consistent with this curve: do not trust the estimates."
@@ -202,7 +202,7 @@ def test_a_constant_restitution_is_named_and_A_has_no_meaning_then():
 
 def test_eps_that_scatters_is_an_alternative():
     gas = glass_beads(0.1)
-    variant = dataclasses.replace(ViscoelasticVariant.of(gas.law), spread=0.15)
+    variant = dataclasses.replace(ViscoelasticVariant.from_law(gas.law), spread=0.15)
     curve = exact_to(dataclasses.replace(gas, law=variant), 0)
     result = without_chance(gas, curve)
     found = next(a for a in result.alternatives if a.name.startswith("eps that scatters"))

@@ -15,7 +15,7 @@ from tests.beads import glass_beads
 from tests.fitting.curves import A, fitted, synthetic
 
 
-class Network(jaxgran.RestitutionLaw):
+class Network(jaxgran.extend.RestitutionLaw):
     """A law whose exponent of loss is a network: it has arrays, and a function among its leaves."""
 
     net: eqx.nn.MLP

@@ -8,7 +8,7 @@ import pytest
 import jaxgran
 from jaxgran.fitting import candidates
 from jaxgran.fitting.twins import Truth, twin
-from tests.beads import glass_beads
+from tests.beads import glass_beads, without
 
 TIMES = np.geomspace(0.1, 10.0, 10)
 GAS = glass_beads()
@@ -100,9 +100,11 @@ def test_twin_is_the_curve_of_the_truth_with_the_relative_errors():
     )
     many = dataclasses.replace(SMOOTH, num_particles=10**7)
     found = twin(many, truth).curve
-    gaussian = jaxgran.cool(gas, TIMES, model=jaxgran.KineticTheory(spin_cumulants=False))
+    gaussian = jaxgran.cool(
+        gas, TIMES, model=jaxgran.KineticTheory(corrections=without("spin_cumulants"))
+    )
     assert np.allclose(found.temperature, gaussian.temperature, rtol=1e-4)
-    exact = jaxgran.cool(gas, TIMES, model=jaxgran.KineticTheory(spin_cumulants=True))
+    exact = jaxgran.cool(gas, TIMES, model=jaxgran.KineticTheory())
     assert np.allclose(found.temperature, exact.temperature, rtol=0.02)
     assert np.allclose(found.temperature_error, 0.02 * found.temperature)
     few = twin(dataclasses.replace(SMOOTH, num_particles=20)).curve

@@ -10,11 +10,11 @@ import pytest
 import jaxgran
 from jaxgran import DSMC
 from jaxgran.particles.dsmc import collisions, dynamics
-from tests.beads import SI, curves_of, glass_beads, hard_gas
+from tests.beads import SI, curves_of, glass_beads, hard_gas, without
 from tests.test_sliding import sliding
 
 # Hard spheres: kinetic theory without the correction for soft contacts.
-THEORY = jaxgran.KineticTheory(softness=False, correlations=False)
+THEORY = jaxgran.KineticTheory(corrections=without("softness", "correlations"))
 
 # Scatter of one run times sqrt(N), over 60 replicas at beta = .05 and .15, d = 2 and 3.
 T_SCATTER, SONINE_SCATTER, MSD_SCATTER = 0.55, 0.7, 1.0
@@ -166,7 +166,8 @@ ALL = {
 }
 WALLS = jaxgran.Walls([0.05, 0.06, 0.08], restitution=jaxgran.Viscoelastic(5e7, 0.22, 3e-6))
 BEADS, EARLY = (jaxgran.KineticTheory(), DSMC(10_000, replicas=4)), (1, 5, 20)
-SLIDES, LATE = (jaxgran.KineticTheory(correlations=False), DSMC(20_000, 2)), (3, 10, 30, 100)
+SLIDES = jaxgran.KineticTheory(corrections=without("correlations")), DSMC(20_000, 2)
+LATE = (3, 10, 30, 100)
 DECADES = np.geomspace(1, (1e3 - 1) / ((1 - 0.8**2) / 6), 8)
 COOLING = {
     # Late noise is that of the clock, which is that of T at half of its logarithm.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from tests.beads import glass_beads, soft_beads
+from tests.beads import glass_beads, soft_beads, without
 
 
 def with_elements(num_particles) -> jaxgran.Gas:
@@ -50,7 +50,7 @@ GASES = {
     "DSMC": (
         glass_beads(),
         jaxgran.DSMC(20_000),
-        jaxgran.KineticTheory(softness=False, correlations=False),
+        jaxgran.KineticTheory(corrections=without("softness", "correlations")),
         (1, 5, 10, 50),
         ("dissipative_constant", "temperature", "packing_fraction"),
         {"temperature": (0.03, 0.003), "collisions": (0.03, 0.003)},

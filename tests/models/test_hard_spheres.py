@@ -20,6 +20,7 @@ from tests.beads import (
     least_distance,
     spheres,
     total_energy,
+    without,
 )
 
 
@@ -124,15 +125,15 @@ def test_a_fast_sphere_outruns_no_list():
 @pytest.mark.slow
 def test_what_is_too_small_is_grown_without_a_trace(monkeypatch):
     gas = hard_gas(0.8, 0.2)
-    plan = HardSpheres(100).sized_for(gas).plan
-    tiny = plan._replace(capacity=jax.tree.map(lambda rows: rows // 3, plan.capacity))
-    small_model = HardSpheres(100, plan=tiny)
+    sizes = HardSpheres(100).sized_for(gas)._sizes
+    tiny = sizes._replace(capacity=jax.tree.map(lambda rows: rows // 3, sizes.capacity))
+    small_model = HardSpheres(100, _sizes=tiny)
     reference, small = curves_of(gas, [0.3, 1.0], HardSpheres(100), small_model)
     # In another order sums are rounded differently, and that grows in the ten impacts of the
     # equilibration; rows are only added at the end, so the order is the same.
     np.testing.assert_array_equal(small.temperature, reference.temperature)
     np.testing.assert_array_equal(small.particles.position, reference.particles.position)
-    monkeypatch.setattr(type(plan.capacity), "grown", lambda *args: pytest.fail("they grew again"))
+    monkeypatch.setattr(type(sizes.capacity), "grown", lambda *args: pytest.fail("they grew again"))
     curves_of(gas, [0.3, 1.0], small_model)
 
 
@@ -140,8 +141,8 @@ def test_what_is_too_small_is_grown_without_a_trace(monkeypatch):
 def test_jit_flags_the_start_of_another_gas_and_what_it_cannot_grow():
     gas = hard_gas(0.8, 0.1)
     model = HardSpheres(100, start=lattice(gas, 100)).sized_for(gas, spare=3.0)
-    few = jax.tree.map(lambda rows: max(rows // 30, 1), model.plan.capacity)
-    short = dataclasses.replace(model, plan=model.plan._replace(capacity=few))
+    few = jax.tree.map(lambda rows: max(rows // 30, 1), model._sizes.capacity)
+    short = dataclasses.replace(model, _sizes=model._sizes._replace(capacity=few))
 
     def cooled(packing_fraction, times, model):
         return jaxgran.cool(gas.replace(packing_fraction=packing_fraction), times, model=model)
@@ -165,10 +166,9 @@ def test_lammps_curve():
     gas, curve = measurement.gas, measurement.curve
     ours = jaxgran.cool(gas, curve.times, model=HardSpheres(1000, replicas=4))
     # LAMMPS resolves contacts, whose softness slows the cooling by 0.5 %.
-    soft, hard = (
-        jaxgran.cool(gas, curve.times, model=jaxgran.KineticTheory(softness=yes)).temperature
-        for yes in (True, False)
-    )
+    soft = jaxgran.cool(gas, curve.times).temperature
+    instant = jaxgran.KineticTheory(corrections=without("softness"))
+    hard = jaxgran.cool(gas, curve.times, model=instant).temperature
     miss = np.abs(ours.temperature * soft / hard / curve.temperature - 1)
     # The errors of three and four replicas are themselves uncertain by half: theory knows them.
     of_one = np.diag(jaxgran.KineticTheory().covariance(gas, curve.times, 1))

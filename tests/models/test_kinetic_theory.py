@@ -9,7 +9,7 @@ import pytest
 import jaxgran
 from experiments.support.closed_forms import paper_temperature
 from jaxgran import KineticTheory
-from tests.beads import curves_of, glass_beads
+from tests.beads import curves_of, glass_beads, without
 
 # d, beta_T0, tau, T/T_0, T/T_0 with a_2 = 0, a_2, <dr^2>: independent solution of the same
 # equations, clipped restitution, Gaussian start, no softness correction.
@@ -25,7 +25,7 @@ REFERENCE = """
 2 .15 10 .3299659 .3283514 -.032185 2.37369
 2 .15 100 .01899688 .01877722 -.033265 10.74937
 """
-HARD = KineticTheory(softness=False, order=2, correlations=False)
+HARD = KineticTheory(corrections=without("softness", "correlations"), order=2)
 
 
 @pytest.mark.parametrize("row", REFERENCE.split("\n")[1:-1])
@@ -33,7 +33,7 @@ HARD = KineticTheory(softness=False, order=2, correlations=False)
 def test_reference_table(row, record):
     d, beta, tau, theta, maxwellian, a2, displacement = (float(x) for x in row.split())
     gas = glass_beads(beta, dimension=int(d))
-    maxwellian_model = KineticTheory(softness=False, sonine=False, correlations=False)
+    maxwellian_model = KineticTheory(corrections=without("softness", "sonine", "correlations"))
     curve, no_a2 = curves_of(gas, [tau], HARD, maxwellian_model)
     found = curve.temperature[0] / gas.temperature, curve.displacement[0] / gas.path_length**2
     errors = np.abs(np.array(found) / np.array([theta, displacement]) - 1)

@@ -7,12 +7,11 @@ import pytest
 
 import jaxgran
 from experiments.fit.own_model import HaffLaw
+from jaxgran.extend import AbstractModel
 from tests.beads import SI, glass_beads, hard_gas
 from tests.fitting.curves import synthetic
 
-MEMBERS = sorted(
-    jaxgran.AbstractModel.__abstractmethods__ | jaxgran.AbstractModel.__abstractclassvars__
-)
+MEMBERS = sorted(AbstractModel.__abstractmethods__ | AbstractModel.__abstractclassvars__)
 
 
 def gas_of(coefficient=0.9):
@@ -78,6 +77,6 @@ def test_choice():
 def test_a_missing_member_is_named():
     for member in MEMBERS:
         members = {name: vars(HaffLaw)[name] for name in MEMBERS if name != member}
-        part = type("Part", (jaxgran.AbstractModel,), members)
+        part = type("Part", (AbstractModel,), members)
         with pytest.raises(TypeError, match=rf"Part.*\b{member}\b"):
             part()

@@ -9,7 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran import HardSpheres, SoftSpheres
-from tests.beads import curves_of, glass_beads, hard_gas, soft_beads, spheres
+from tests.beads import curves_of, glass_beads, hard_gas, soft_beads, spheres, without
 
 
 def between_walls(law, beta=0.15, wall_beta=None) -> jaxgran.Gas:
@@ -63,7 +63,8 @@ def test_cools_as_kinetic_theory_says(scene):
     gas, model, taus, allowed = COOLING[scene]
     # Without walls in a box below L_c, so that the gas stays homogeneous.
     assert gas.container is not None or gas.box_side(model.num_particles) < 1.5 * gas.critical_box
-    theory = jaxgran.KineticTheory(softness=isinstance(model, SoftSpheres))
+    names = () if isinstance(model, SoftSpheres) else ("softness",)
+    theory = jaxgran.KineticTheory(corrections=without(*names))
     theory, curve = curves_of(gas, taus, theory, model)
     # The number of impacts scatters as its root.
     impacts = curve.collisions * model.num_particles * model.replicas / 2

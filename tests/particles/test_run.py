@@ -92,7 +92,7 @@ def decaying(fails_at=np.inf, grows_at=np.inf) -> Recorder:
 
 
 def on_host(recorder, **options):
-    options = jaxgran.Run(**{"progress": False} | options)
+    options = jaxgran.extend.Run(**{"progress": False} | options)
     return run_on_host(recorder, TIMES, None, jax.random.key(0), None, Groups(1), options, TIMES)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from tests.beads import SI, hard_gas, theory_curve
+from tests.beads import SI, hard_gas, theory_curve, without
 
 RATE = 3e-3  # of the drive, T_0 per mean free time
 LATE = np.array([0.0, 2000.0, 3000.0])
@@ -27,7 +27,7 @@ def sonine_of_van_noije_and_ernst(eps, d):
 @pytest.mark.parametrize("eps", [0.5, 0.8, 0.95])
 def test_the_steady_state_is_that_of_van_noije_and_ernst(eps, dimension):
     gas = constant(eps, dimension)
-    curve = theory_curve(gas, LATE, order=2, correlations=False)
+    curve = theory_curve(gas, LATE, order=2, corrections=without("correlations"))
     expected = sonine_of_van_noije_and_ernst(eps, dimension)
     # They linearise in a_2: what is left out is a_2 of itself, at most .09, by a factor of order 1;
     # 1e-5 is for eps near the zero of a_2.

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 import jaxgran
 from jaxgran.data.header import gas_of_header
 from jaxgran.theory.averages import impact_moments
-from tests.beads import SI, glass_beads, hard_gas, theory_curve
+from tests.beads import SI, glass_beads, hard_gas, theory_curve, without
 from tests.data.test_faults_csv import gas_of, header_of
 
 TAUS = np.geomspace(1.0, 300.0, 8)
@@ -24,7 +24,7 @@ def constant(eps, dimension=3, **elements) -> jaxgran.Gas:
 def test_perfectly_rough_elastic_spheres_keep_their_energy(dimension, spins):
     surface = jaxgran.Rough(1.0, rotational_temperature=2e-3)
     gas = constant(1.0, dimension, surface=surface)
-    curve = theory_curve(gas, TAUS, correlations=False)
+    curve = theory_curve(gas, TAUS, corrections=without("correlations"))
     energy = dimension * curve.temperature + spins * curve.rotational_temperature
     np.testing.assert_allclose(energy, dimension * 0.01 + spins * 2e-3, rtol=1e-8)
     # In the end each of the d + d_rot squares of the energy has the same share.
@@ -39,7 +39,7 @@ def test_the_temperatures_reach_the_ratio_of_the_literature(eps, beta, inertia):
     # state of inelastic rough spheres, Maxwellian.
     q, surface = inertia, jaxgran.Rough(beta, inertia=inertia, rotational_temperature=0.01)
     gas = constant(eps, surface=surface)
-    options = {"sonine": False, "spin_cumulants": False, "correlations": False}
+    options = {"corrections": without("sonine", "spin_cumulants", "correlations")}
     curve = theory_curve(gas, np.array([1e6]), **options)
     c = (1 + q) ** 2 / (2 * q * (1 + beta) ** 2)
     c *= 1 - eps**2 - (1 - q) / (1 + q) * (1 - beta**2)
@@ -51,7 +51,7 @@ def test_the_temperatures_reach_the_ratio_of_the_literature(eps, beta, inertia):
 def test_spins_of_inelastic_spheres_have_a_cooling_state():
     # DSMC of 40 000 spheres after 1000 mean free times: 2.53 +- .04, and Gaussian spins have 2.85.
     gas = constant(0.6, surface=jaxgran.Rough(-0.3, rotational_temperature=0.01))
-    curve = theory_curve(gas, np.array([1e3, 1e6]), correlations=False)
+    curve = theory_curve(gas, np.array([1e3, 1e6]), corrections=without("correlations"))
     ratios = np.asarray(curve.rotational_temperature / curve.temperature)
     np.testing.assert_allclose(ratios, 2.53, rtol=0.04)
     np.testing.assert_allclose(ratios[0], ratios[1], rtol=0.01)
@@ -62,7 +62,7 @@ def test_walls_take_energy_as_haff_has_it():
     # layer before the wall brings 2/(1 + e) of the impacts, warmer by the heat that flows to it
     # (.8634/5), and colder by its conduction over the width.
     gas = constant(1.0, container=jaxgran.Walls(0.05, restitution=0.8))
-    curve = theory_curve(gas, TAUS, sonine=False)
+    curve = theory_curve(gas, TAUS, corrections=without("sonine"))
     phi = 0.02
     pressure = 1 + 4 * phi * (1 - phi / 2) / (1 - phi) ** 3
     assert float(gas.mean_free_path) < float(constant(1.0).mean_free_path)
@@ -79,7 +79,7 @@ def test_walls_take_energy_as_haff_has_it():
 def test_walls_take_more_from_fast_spheres():
     # DSMC of 800 000 spheres: T has an error of .1 %, a_2 of .003. Without walls a_2 is -.015.
     gas = constant(0.9, container=jaxgran.Walls(0.05, restitution=0.8))
-    curve = theory_curve(gas, np.array([1.0, 3.0, 10.0]), correlations=False)
+    curve = theory_curve(gas, np.array([1.0, 3.0, 10.0]), corrections=without("correlations"))
     T = curve.temperature / gas.temperature
     np.testing.assert_allclose(T, [0.85653, 0.64930, 0.30791], rtol=2e-3)
     np.testing.assert_allclose(curve.sonine, [-0.0119, -0.0293, -0.0383], atol=0.01)
@@ -96,7 +96,7 @@ def test_elastic_walls_are_met_by_a_gas_everywhere_alike(dimension):
         gas = hard_gas(1.0, 0.02, dimension, container=jaxgran.Walls(width + 1, restitution=eps))
         # d pairs of walls; each impact takes (1 - eps^2) T of the energy d T/2.
         alike = 4 * (1 - eps**2) * pressure / width / np.sqrt(2 * np.pi)
-        maxwellian = jaxgran.KineticTheory(sonine=False)
+        maxwellian = jaxgran.KineticTheory(corrections=without("sonine"))
         T = jaxgran.cool(gas, [0.02 / alike], model=maxwellian).temperature[0]
         return 100 * (float(T) ** -0.5 - 1)  # T = (1 + rate t/2)^-2
 
@@ -180,7 +180,7 @@ def test_rejected_steps_leave_no_values():
     gas = constant(1.0, drag=jaxgran.StokesDrag(1.0))
     taus, rate = np.array([1e-5, 1e-4, 1e-3]), 3e3
     gas = gas.replace(drag_rate=rate / float(gas.mean_free_time))
-    curve = theory_curve(gas, taus, correlations=False)
+    curve = theory_curve(gas, taus, corrections=without("correlations"))
     left = np.exp(-rate * taus)
     expected = float(gas.temperature / gas.value("drag_rate")) * left * (1 - left)
     np.testing.assert_allclose(curve.diffusion, expected, rtol=2e-3)  # collisions: 1e-3
@@ -192,8 +192,8 @@ def test_spins_that_heat_the_gas_stay_within_the_table_of_rates():
     q, beta = 0.4, 0.5
     surface = jaxgran.Rough(beta, inertia=q, rotational_temperature=0.1)
     gas, taus = dataclasses.replace(glass_beads(0.02), surface=surface), np.array([0.3, 1.0, 3.0])
-    options = {"sonine": False, "softness": False, "correlations": False}
-    curve = theory_curve(gas, taus, spin_cumulants=False, **options)
+    names = "sonine", "softness", "correlations", "spin_cumulants"
+    curve = theory_curve(gas, taus, corrections=without(*names))
     assert float(curve.temperature[2]) > 2 * float(gas.temperature)
     eta = q * (1 + beta) / (2 * (1 + q))
 

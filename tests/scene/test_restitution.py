@@ -64,7 +64,7 @@ def test_series_of_viscoelastic_spheres():
     np.testing.assert_allclose(law.coefficients[:2], first_two, rtol=1e-14)
 
 
-class Plastic(jaxgran.RestitutionLaw):
+class Plastic(jaxgran.extend.RestitutionLaw):
     """Losses begin at a yield speed; in m/s, and with no other member than its eps."""
 
     yield_speed: float
@@ -87,7 +87,7 @@ def test_a_law_of_the_speed_alone_is_one_function():
 
 
 def test_a_law_may_give_one_number_for_all_speeds():
-    class Same(jaxgran.RestitutionLaw):
+    class Same(jaxgran.extend.RestitutionLaw):
         coefficient: float
 
         def restitution(self, normal_speed):
@@ -110,7 +110,7 @@ def test_restitution_is_a_fraction_that_falls(clipped):
 def test_a_variant_is_the_viscoelastic_law_or_one_whose_eps_scatters():
     gas = glass_beads(0.3)
     speeds = jnp.array([0.02, 0.5, 2.0])
-    same = dataclasses.replace(gas, law=ViscoelasticVariant.of(gas.law))
+    same = dataclasses.replace(gas, law=ViscoelasticVariant.from_law(gas.law))
     powers = same.reduced_law.loss_powers(speeds, 6)
     np.testing.assert_allclose(powers, gas.reduced_law.loss_powers(speeds, 6), rtol=1e-12)
     constant = same.replace(exponent=0.0).restitution(np.array([0.01, 1.0]))

@@ -16,6 +16,8 @@ ROOT = Path(__file__).parents[2]
 PAGES = ROOT / "docs" / "pages"
 TEXTS = {page.stem: page.read_text(encoding="utf-8") for page in sorted(PAGES.glob("*.md"))}
 RECORDED = runpy.run_path(str(ROOT / "docs" / "recorded.py"))
+PUBLIC = {*jaxgran.__all__, *(f"extend.{name}" for name in jaxgran.extend.__all__)}
+PUBLIC -= {"extend", "observables"}
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 RUN = """
 import subprocess, sys
@@ -62,17 +64,16 @@ def test_the_site_is_built_without_a_warning_and_fetches_nothing(tmp_path):
     for page in pages:
         assert not re.findall(FETCHED, page.read_text(encoding="utf-8")), page.name
     api = (tmp_path / "api.html").read_text(encoding="utf-8")
-    names = {*jaxgran.__all__} - {"observables"}
     for full in (
-        *(f"jaxgran.{name}" for name in names),
+        *(f"jaxgran.{name}" for name in PUBLIC),
         *(f"jaxgran.particles.observables.{name}" for name in jaxgran.observables.__all__),
     ):
         assert f'id="{full}"' in api, f"{full} is not on the API page"
 
 
 def test_every_public_name_is_on_the_api_page():
-    shown = re.findall(r"^::: jaxgran\.(\w+)$", TEXTS["api"], re.MULTILINE)
-    assert sorted(shown) == sorted({*jaxgran.__all__} - {"observables"})
+    shown = re.findall(r"^::: jaxgran\.(\w+|extend\.\w+)$", TEXTS["api"], re.MULTILINE)
+    assert sorted(shown) == sorted(PUBLIC)
 
 
 def test_the_numbers_of_the_readme_are_those_of_the_pages():

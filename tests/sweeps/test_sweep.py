@@ -13,7 +13,7 @@ import pytest
 
 import jaxgran
 from jaxgran import observables
-from tests.beads import assert_same, glass_beads
+from tests.beads import assert_same, glass_beads, without
 from tests.sweeps.process import TIMES, members
 
 GAS, GASES = glass_beads(), members(5)
@@ -145,7 +145,7 @@ def test_a_finished_store_is_read(store, store_of_saved):
     ("changed", "message"),
     [
         ({"times": (0.1, 1.0, 11.0)}, "another sweep, with another times. Name another store"),
-        ({"model": jaxgran.KineticTheory(softness=False)}, "with another model"),
+        ({"model": jaxgran.KineticTheory(corrections=without("softness"))}, "with another model"),
         ({"key": jax.random.key(7)}, "with another key"),
         ({"gases": jax.tree.map(lambda x: x[:4], GASES)}, "with another gases, key"),
         ({"chunk": 3}, "with another chunk"),
@@ -196,8 +196,8 @@ def test_a_chunk_is_run_again_if_a_member_overflows_its_arrays(monkeypatch):
     def short_below_1(model, gases, spare):
         model = sized_for_all(model, gases, 2.0)
         names = "capacity", "equilibration_capacity"
-        few = {name: getattr(model.plan, name)._replace(pairs=20) for name in names}
-        short = dataclasses.replace(model, plan=model.plan._replace(**few))
+        few = {name: getattr(model._sizes, name)._replace(pairs=20) for name in names}
+        short = dataclasses.replace(model, _sizes=model._sizes._replace(**few))
         return short if spare < 1 else model
 
     def curves(*factors):
@@ -241,7 +241,7 @@ TWO_LENGTHS = GAS.replace(temperature=jnp.ones(3), diameter=jnp.ones(2))
         ({"store": 3}, "store must be a path, got 3"),
         ({"key": 3}, "key must be a key .* or an array of keys"),
         ({"gases": {"dissipation": A}}, "got a dict. Build it by jax.vmap"),
-        ({"gases": GAS}, "no float of gases has a leading axis"),
+        ({"gases": GAS}, "no parameter of gases has a leading axis"),
         ({"gases": jax.tree.map(lambda x: x[:0], GASES)}, "one length, at least 1, got .* 0"),
         ({"gases": TWO_LENGTHS}, "one length, at least 1, got .*diameter 2.* temperature 3"),
         ({"key": jax.random.split(jax.random.key(0))}, "key 2, .*dissipative_constant 5"),

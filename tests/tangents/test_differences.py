@@ -104,7 +104,10 @@ def test_soft_spheres_have_the_difference_of_two_runs():
         changed = gas.replace(
             dissipative_constant=gas.value("dissipative_constant") * jnp.exp(log_scale)
         )
-        return model.simulate(changed, times, jaxgran.Run()).replicas.temperature / gas.temperature
+        return (
+            model.simulate(changed, times, jaxgran.extend.Run()).replicas.temperature
+            / gas.temperature
+        )
 
     f = partial(ratios, differences=0.3)
     value, slope = jax.jvp(f, (0.0,), (1.0,))
@@ -127,7 +130,7 @@ def test_what_differences_do_not_know_is_refused():
 
     def temperature(A):
         changed = gas.replace(dissipative_constant=A)
-        return model.simulate(changed, jnp.array([1e-3]), jaxgran.Run()).temperature
+        return model.simulate(changed, jnp.array([1e-3]), jaxgran.extend.Run()).temperature
 
     with pytest.raises(ValueError, match="this gas has no loss"):
         jax.jvp(temperature, (0.0,), (1.0,))

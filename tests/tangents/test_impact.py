@@ -63,7 +63,7 @@ def constant():
 
     def f(x, checkpoint=None):
         changed = gas.replace(coefficient=x[0], temperature=jnp.exp(x[2]))
-        run = jaxgran.Run(checkpoint=checkpoint)
+        run = jaxgran.extend.Run(checkpoint=checkpoint)
         return jnp.log(model.simulate(changed, times * jnp.exp(x[1]), run).temperature)
 
     at = jnp.array([COEFFICIENT, 0.0, 0.0])

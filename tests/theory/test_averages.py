@@ -11,7 +11,7 @@ import pytest
 import jaxgran
 from jaxgran.theory import averages as kinetics
 from jaxgran.theory.averages import RateTable, collision_changes
-from tests.beads import glass_beads, hard_gas, theory_curve
+from tests.beads import glass_beads, hard_gas, theory_curve, without
 
 
 def test_averages_of_constant_restitution():
@@ -89,7 +89,9 @@ def cooling_state(dimension, eps):
         # 60 collisions by Haff's law, exp(-11) of the start of D at eps = .05.
         loss = jnp.maximum((1 - e**2) / (2 * dimension), 1e-9)
         taus = jnp.expm1(60 * loss) / loss * jnp.array([0.5, 1.0])
-        curve = theory_curve(gas.replace(coefficient=e), taus, correlations=False, rtol=1e-6)
+        curve = theory_curve(
+            gas.replace(coefficient=e), taus, corrections=without("correlations"), rtol=1e-6
+        )
         reduced = curve.diffusion / gas.path_length / jnp.sqrt(2 * curve.temperature)
         return curve.sonine[-1], curve.third_sonine[-1], reduced[-1]
 

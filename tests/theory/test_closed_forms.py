@@ -9,7 +9,7 @@ import pytest
 
 import jaxgran
 from experiments.support import closed_forms as forms
-from tests.beads import glass_beads, hard_gas, theory_curve
+from tests.beads import glass_beads, hard_gas, theory_curve, without
 
 RATE = 0.831934150151502
 """Initial cooling rate of viscoelastic spheres, 1/tau_0 in units of delta/tau_c: checked value."""
@@ -30,7 +30,7 @@ def test_constants_of_the_expansion():
 
 
 TAUS = np.geomspace(1e-3, 1e8, 100)
-HAFF = {"sonine": False, "correlations": False, "rtol": 1e-9}
+HAFF = {"corrections": without("sonine", "correlations"), "rtol": 1e-9}
 """Settings of kinetic theory with which constant restitution obeys Haff's law."""
 
 
@@ -68,7 +68,9 @@ def test_expansion_is_right_to_its_order():
             A = gas.value("dissipative_constant") * delta / gas.delta
             gas = dataclasses.replace(gas, law=jaxgran.Viscoelastic(5e7, 0.22, A, clipped))
             tau = jnp.geomspace(0.01, 1e4, 40) / delta
-            curve = theory_curve(gas, tau, sonine=False, softness=False, correlations=False)
+            curve = theory_curve(
+                gas, tau, corrections=without("sonine", "softness", "correlations")
+            )
             theta = curve.temperature / 0.01
             formula = forms.paper_temperature(tau, delta, clipped=clipped)
             ratios.append(float(jnp.max(jnp.abs(formula / theta - 1))) / delta**2.5)
@@ -80,7 +82,7 @@ def test_displacement_of_constant_restitution():
     for d, e in ((3, 0.6), (2, 0.9)):
         gas = hard_gas(e, dimension=d)
         tau = jnp.geomspace(0.01, 1e6, 50)
-        curve = theory_curve(gas, tau, sonine=False, correlations=False, rtol=1e-9)
+        curve = theory_curve(gas, tau, corrections=without("sonine", "correlations"), rtol=1e-9)
         # Brilliantov & Poeschel, Eqs. (45), (46); of dD/dt = T - D/tau_v, 1/tau_v = nu (1 + e)/d,
         # follows <dr^2> = (2 d/k) (N - (1 - exp(-k N))/k) with k = (1 + e)^2/(2 d).
         loss, k = (1 - e**2) / (2 * d), (1 + e) ** 2 / (2 * d)
@@ -98,7 +100,7 @@ def test_first_order_of_viscoelastic_gas():
     for delta in (1e-4, 1e-3):
         gas = glass_beads(1.5 * 2**0.1 * delta)
         tau = (u - 1) / (RATE * delta)
-        options = {"softness": False, "order": 2, "correlations": False}
+        options = {"corrections": without("softness", "correlations"), "order": 2}
         curve = theory_curve(gas, tau, rtol=1e-11, **options)
         leading = 54 / (RATE * delta) * (u ** (1 / 6) - 1)
         unit = gas.temperature * gas.mean_free_time**2

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from tests.beads import hard_gas, theory_curve
+from tests.beads import hard_gas, theory_curve, without
 
 MAX_WAVENUMBER = {2: (0.181, 3.10), 3: (0.926, 2.19)}
 """a, b of ``K sigma = a + b phi``, fitted to experiments/accuracy/measure_correlations.py."""
@@ -18,7 +18,7 @@ def slowdown(gas):
     """h of spheres all of whose impacts dissipate alike, seen after 4 and 40 collisions each."""
     loss = (1 - gas.coefficient**2) / gas.dimension
     taus = jnp.expm1(loss / 2 * jnp.array([4.0, 40.0])) / (loss / 2)
-    curve = theory_curve(gas, taus, sonine=False, rtol=1e-10)
+    curve = theory_curve(gas, taus, corrections=without("sonine"), rtol=1e-10)
     # dln T/dn = -(1 - e^2)/d (1 - h B(n)): correlations have built up as B = 1 - exp(-n/4).
     n = curve.collisions
     return np.asarray((n + jnp.log(curve.temperature) / loss) / (n + 4 * jnp.expm1(-n / 4)))
@@ -50,13 +50,15 @@ def test_slowing_of_elastic_and_of_strongly_dissipating_spheres(dimension):
     # Of the solver: 1e-8.
     assert min(every) > -1e-8 and max(every) < 0.04 and every[11] > 0
     gas, taus = hard_gas(1.0, 0.3, dimension), np.array([4.0, 40.0])
-    elastic = theory_curve(gas, taus, sonine=False, rtol=1e-10)
+    elastic = theory_curve(gas, taus, corrections=without("sonine"), rtol=1e-10)
     assert np.all(elastic.temperature == 1.0)
 
 
 def test_elastic_spheres_have_a_derivative():
     def temperature(e):
-        return theory_curve(hard_gas(e, 0.3), jnp.array([2.0]), sonine=False).temperature[0]
+        return theory_curve(
+            hard_gas(e, 0.3), jnp.array([2.0]), corrections=without("sonine")
+        ).temperature[0]
 
     _, slope = jax.jit(lambda e: jax.jvp(temperature, (e,), (1.0,)))(1.0)
     np.testing.assert_allclose(slope, 4 / 3, rtol=1e-7)  # two collisions each, of 1 - e^2 over d

@@ -16,9 +16,9 @@ from jaxgran.scene.gas import reduced_scene
 from jaxgran.theory import covariance
 from jaxgran.theory.averages import loss_moments, rough_energy_moments
 from jaxgran.theory.equations import Density, Spins, element_rates
-from tests.beads import glass_beads, hard_gas
+from tests.beads import glass_beads, hard_gas, without
 
-THEORY = jaxgran.KineticTheory(softness=False, correlations=False)
+THEORY = jaxgran.KineticTheory(corrections=without("softness", "correlations"))
 ROUGH = jaxgran.Rough(0.2, rotational_temperature=6e-3)
 SLIDING = replace(ROUGH, friction=jnp.asarray(0.2))
 WALLS = jaxgran.Walls([0.05, 0.06, 0.08], restitution=0.8, tangential_restitution=0.2)
@@ -66,9 +66,9 @@ def test_stored_runs_scatter_as_theory_says(name):
     scene = runs.ALL[scene_name]
     stored = {field: STORED[f"{name}/{field}"] for field in runs.FIELDS}
     gas = scene.make()
-    floats = json.loads(str(stored["gas"]))
-    for float_name, value in runs.floats_of(gas).items():  # the runs are of this scene
-        np.testing.assert_allclose(value, floats[float_name], rtol=1e-12)
+    parameters = json.loads(str(stored["gas"]))
+    for key, value in runs.parameters_of(gas).items():  # the runs are of this scene
+        np.testing.assert_allclose(value, parameters[key], rtol=1e-12)
     n, num_runs = len(stored["mean"]), int(stored["runs"])
     lower = np.zeros((n, n))
     lower[np.tril_indices(n)] = stored["covariance"]
@@ -137,7 +137,7 @@ def test_energies_of_rough_impacts_are_those_of_sampled_pairs(dimension, frictio
 
 @pytest.mark.parametrize("power", [0.0, 0.2, 0.5])
 def test_spread_of_losses_of_a_power_law(power):
-    class Loss(jaxgran.RestitutionLaw):
+    class Loss(jaxgran.extend.RestitutionLaw):
         power: float
 
         def restitution(self, normal_speed):

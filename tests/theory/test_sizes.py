@@ -14,9 +14,9 @@ from jaxgran.fitting.prediction import _compiled
 from jaxgran.fitting.rows import Noise
 from jaxgran.scene.gas import reduced_scene
 from jaxgran.theory import sizes
-from tests.beads import glass_beads, hard_gas
+from tests.beads import glass_beads, hard_gas, without
 
-THEORY = jaxgran.KineticTheory(softness=False, correlations=False)
+THEORY = jaxgran.KineticTheory(corrections=without("softness", "correlations"))
 
 
 def of_sizes(gas, spread):

@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 
 import jaxgran
-from tests.beads import hard_gas
+from tests.beads import hard_gas, without
 
 LENGTH = 0.2
 """X_T of the gases, the length scale of overlaps at sqrt(2 T_0), in diameters."""
@@ -22,7 +22,7 @@ def soft_gas(beta, phi, dimension):
 
 def slowing(gas):
     """Cooling rate at T_0 over that of instantaneous impacts, (1 - c X_T)/(1 + k X_T)."""
-    theory = jaxgran.KineticTheory(sonine=False, correlations=False, rtol=1e-12)
+    theory = jaxgran.KineticTheory(corrections=without("sonine", "correlations"), rtol=1e-12)
     short = 1e-3 * np.array([0.25, 0.5, 0.75, 1.0])
     T = jaxgran.cool(gas, short / theory.cooling_rate(gas), model=theory).temperature
     return np.polyfit(short, -np.log(T) / short, 3)[-1]  # at t = 0

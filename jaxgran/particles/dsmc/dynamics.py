@@ -82,8 +82,8 @@ class DSMCGas(NamedTuple):
     """Particles of all replicas, each at its own time.
 
     Attributes:
-        clock: time of each replica.
-        clock_rest: rounding error of `clock`, for a compensated sum.
+        time: time of each replica.
+        time_rest: rounding error of `time`, for a compensated sum.
         duration: length of the next step over its mean, see `waiting_time`.
         temperature: T/T_0, updated by the losses, recomputed every `RECOUNT_INTERVAL` steps.
         particles: the 2 d components of v and of x - v t, which only collisions change, and the
@@ -94,8 +94,8 @@ class DSMCGas(NamedTuple):
         tangents: of the energies, see `ExchangeTangents`; None without them.
     """
 
-    clock: Float[Array, "*replicas"]
-    clock_rest: Float[Array, "*replicas"]
+    time: Float[Array, "*replicas"]
+    time_rest: Float[Array, "*replicas"]
     duration: Float[Array, "*replicas"]
     temperature: Float[Array, "*replicas"]
     particles: Float[Array, "*replicas N components"]
@@ -145,7 +145,7 @@ class EnergyGains(NamedTuple):
     by_scale: Float[Array, "energies energies"] | None = None
 
 
-def slopes_along(gradient: Any, directions: Any) -> Float[Array, "p"]:
+def directional_slopes(gradient: Any, directions: Any) -> Float[Array, "p"]:
     """Return the derivatives along some directions, from the derivatives in all numbers."""
     products = jax.tree.map(lambda g, x: jnp.tensordot(x, g, g.ndim), gradient, directions)
     return sum(jax.tree.leaves(products), start=jnp.zeros(1))  # a law may have no floats
@@ -202,8 +202,8 @@ class DSMCDynamics(AbstractDynamics):
             tangents = ExchangeTangents.initial(directions, scene, velocity, replicas)
         zero = jnp.zeros(replicas, v.dtype)
         gas = DSMCGas(
-            clock=zero,
-            clock_rest=zero,
+            time=zero,
+            time_rest=zero,
             duration=waiting_time(jax.random.fold_in(key, 1), self.scheme.candidates, zero),
             temperature=zero + 1,
             particles=jnp.concatenate(parts, axis=-1),
@@ -244,7 +244,7 @@ class DSMCDynamics(AbstractDynamics):
         in_parts = jnp.array([False, True])
         (gas, shown), _ = jax.lax.scan(move, (state.gas, state.shown), in_parts)
         reached = ~jnp.any(self.is_due(gas, until))
-        time = jnp.where(reached, until, jnp.min(gas.clock))
+        time = jnp.where(reached, until, jnp.min(gas.time))
         too_fast = shown.missed > ALLOWED_MISSED * shown.collisions + 1
         finite = jnp.isfinite(jnp.sum(shown.particles, axis=(1, 2)))
         fault = status.flag(status.TOO_FAST, too_fast) | status.flag(status.NOT_FINITE, ~finite)
@@ -286,7 +286,7 @@ class DSMCDynamics(AbstractDynamics):
         walls = self.scene.walls
         d = self.scheme.dimension
         speed = FASTEST_SPEED * jnp.sqrt(gas.temperature)
-        true_speed = speed * drag_decay(self.scene.drag, gas.clock).velocity
+        true_speed = speed * drag_decay(self.scene.drag, gas.time).velocity
         eps = walls.law.restitution(true_speed)[..., None]
         frequency = jnp.broadcast_to(walls.frequency, (*eps.shape[:-1], d))
         ratio = wall_impact_ratio(eps, frequency / collision_rate(0.0, d), d)
@@ -303,7 +303,7 @@ class DSMCDynamics(AbstractDynamics):
             ds = ds / jnp.maximum(self.max_wall_impacts(gas, ds), 1.0)
         if self.scene.drive is None:
             return ds
-        growth = self.scene.drive / drag_decay(self.scene.drag, gas.clock).velocity ** 3
+        growth = self.scene.drive / drag_decay(self.scene.drag, gas.time).velocity ** 3
         safe = jnp.where(growth > 0, growth, 1.0)
         return jnp.where(growth > 0, jnp.minimum(ds, MAX_KICK * gas.temperature / safe), ds)
 
@@ -327,7 +327,7 @@ class DSMCDynamics(AbstractDynamics):
 
         kicks = walls = None
         if self.scene.drive is not None:
-            growth = self.kick_growth(gas.clock, ds, 0.0)
+            growth = self.kick_growth(gas.time, ds, 0.0)
             safe = jnp.where(gas.temperature > 0, gas.temperature, 1.0)
             kicks = at_least(parts * growth / (MAX_KICK * safe))
         if self.scene.walls is not None:
@@ -352,7 +352,7 @@ class DSMCDynamics(AbstractDynamics):
         def step_due(carry: tuple) -> tuple:
             gas, steps_left = carry
             full = self.full_step(gas)
-            share = self.is_due(gas, until).astype(gas.clock.dtype)
+            share = self.is_due(gas, until).astype(gas.time.dtype)
             if scene.drive is not None or scene.walls is not None:
                 share = share * self.step_length(gas) / full
             part = jnp.clip(time_left(gas, until) / full, 0.0, 1.0)
@@ -411,19 +411,19 @@ class DSMCDynamics(AbstractDynamics):
         key = jax.random.fold_in(key, gas.steps)
         dt = share * self.full_step(gas)
         kicks, walls = zip(subsets, largest, strict=True)
-        kick = partial(self._kick, key=key, dt=dt, counts=kicks, clock=gas.clock)
+        kick = partial(self._kick, key=key, dt=dt, counts=kicks, time=gas.time)
         gas = kick(gas, place=0)
         particles, outcome, gains = self._collide(gas, key, dt, chance)
         if self.scene.walls is not None:
             particles, more = self._hit_walls(gas, key, dt, particles, walls)
             gains = jax.tree.map(jnp.add, gains, more)
         energy = scheme.num_particles * scheme.dimension / 2  # sum v^2 at T_0
-        passed = gas.clock_rest + dt
-        clock = gas.clock + passed
+        passed = gas.time_rest + dt
+        after = gas.time + passed
         next_duration = waiting_time(jax.random.fold_in(key, 4), scheme.candidates, gas.duration)
         gas = gas._replace(
-            clock=clock,
-            clock_rest=passed - (clock - gas.clock),
+            time=after,
+            time_rest=passed - (after - gas.time),
             duration=jnp.where(share > 0, next_duration, gas.duration),
             temperature=gas.temperature + gains.values[0] / energy,
             particles=particles,
@@ -442,7 +442,7 @@ class DSMCDynamics(AbstractDynamics):
         key: PRNGKeyArray,
         dt: Float[Array, ""],
         counts: tuple[Int[Array, ""] | None, Int[Array, ""] | None],
-        clock: Float[Array, ""],
+        time: Float[Array, ""],
         place: int,
     ) -> DSMCGas:
         """Apply half of the kicks of a step, at its start (place 0) or end (1).
@@ -454,11 +454,11 @@ class DSMCDynamics(AbstractDynamics):
             return gas
         d = self.scheme.dimension
         parts = num_subsets(self.scheme.num_particles)
-        growth = self.kick_growth(clock, dt, float(place))
+        growth = self.kick_growth(time, dt, float(place))
         key = jax.random.fold_in(key, 2 + place)
         at_rest = self.scene.walls is None
         size = jnp.sqrt(growth / 2 * (parts / kicked).astype(growth.dtype))
-        time = gas.clock
+        time = gas.time
 
         def kick(i: Array, rows: Array, belongs: Array) -> tuple[Array, Array]:
             v = rows[:, :d]
@@ -488,7 +488,7 @@ class DSMCDynamics(AbstractDynamics):
         v = old[:, :d]
         spin = old[:, 2 * d :]
         # Collisions happen at the middle of the step, on average: x - v t changes by -kick t.
-        middle = gas.clock + dt / 2
+        middle = gas.time + dt / 2
         ceiling = CEILING * jnp.sqrt(gas.temperature)
 
         def collided(relative: Array, spins: Array, bits: Array) -> tuple[EnergyGains, Outcome]:
@@ -535,7 +535,7 @@ class DSMCDynamics(AbstractDynamics):
         Returns the particles and the gains.
         """
         d = self.scheme.dimension
-        middle = gas.clock + dt / 2
+        middle = gas.time + dt / 2
         axis = (gas.steps % d).astype(jnp.int32)
         across = (jnp.arange(d, dtype=jnp.int32) == axis).astype(particles.dtype)[None]
         key = jax.random.fold_in(key, 1)
@@ -627,7 +627,7 @@ class DSMCDynamics(AbstractDynamics):
 
         def slopes(weights: Array) -> tuple[Array, Array]:
             in_scene, in_scales = pull(weights)
-            return slopes_along(in_scene, tangents.directions), in_scales
+            return directional_slopes(in_scene, tangents.directions), in_scales
 
         by_direction, by_scale = jax.vmap(slopes)(jnp.eye(self.num_energies, dtype=same.dtype))
         return EnergyGains(gains, by_direction.T, by_scale.T), others
@@ -643,14 +643,14 @@ class DSMCDynamics(AbstractDynamics):
         if scene.drive is not None:
 
             def heating(scene: ReducedScene) -> Array:
-                kicks = partial(kick_variance, scene.drive, scene.drag, before.clock, ds)
+                kicks = partial(kick_variance, scene.drive, scene.drag, before.time, ds)
                 return self.scheme.num_particles * d / 2 * (kicks(0.0) + kicks(1.0))
 
             heat, pull = jax.vjp(heating, scene)
             (in_scene,) = pull(jnp.ones_like(heat))
-            along = slopes_along(in_scene, before.tangents.directions)
+            slopes = directional_slopes(in_scene, before.tangents.directions)
             values = values.at[0].add(heat)
-            by_direction = by_direction.at[:, 0].add(along)
+            by_direction = by_direction.at[:, 0].add(slopes)
             # The rate of impacts depends on the speeds; kicks do not depend on them.
             by_scale = by_scale.at[0, 0].add(-heat)
         energies = [jnp.sum(before.particles[:, :d] ** 2)]
@@ -663,7 +663,7 @@ class DSMCDynamics(AbstractDynamics):
 
 def time_left(gas: DSMCGas, until: ArrayLike) -> Float[Array, "*replicas"]:
     """Return the time from each replica to a time."""
-    return (jnp.asarray(until) - gas.clock) - gas.clock_rest
+    return (jnp.asarray(until) - gas.time) - gas.time_rest
 
 
 @jax.jit
@@ -685,7 +685,7 @@ def dsmc_records(dynamics: DSMCDynamics, state: DSMCState) -> Records:
         "collisions": 2 / n * gas.collisions,
     }
     if scene.walls is None:  # walls would limit <dr^2>
-        position = gas.particles[..., d : 2 * d] + gas.clock[:, None, None] * v
+        position = gas.particles[..., d : 2 * d] + gas.time[:, None, None] * v
         displacement = position - jnp.mean(position, axis=1, keepdims=True)
         values["displacement"] = observables.mean_square_displacement(displacement)
     if scene.surface is not None:

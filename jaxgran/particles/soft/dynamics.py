@@ -181,9 +181,9 @@ class SoftDynamics(AbstractSphereDynamics):
         if spin is not None:
             changes.append(ROTATION)
             # Spins of q s^2 = ratio: nan along a ratio that is 0, of which they are a square root.
-            along = directions.surface.ratio
+            ratio_tangents = directions.surface.ratio
             ratio = self.scene.material.surface.ratio
-            growth = jnp.where(along == 0, 0.0, along / ratio)
+            growth = jnp.where(ratio_tangents == 0, 0.0, ratio_tangents / ratio)
             spin_tangent = 0.5 * growth[:, None, None] * spin[None]
         rates = RateSums.zero(len(changes), self.replicas, state.velocity.dtype)
         return ContactTangents.initial(directions, state.velocity, rates, spin_tangent)
@@ -414,7 +414,7 @@ class SoftDynamics(AbstractSphereDynamics):
 
         spheres = Spheres(state.position, state.velocity, state.internal.spin)
         tangents = state.tangents
-        if tangents is None or len(tangents.clock) == 0:
+        if tangents is None or len(tangents.delay) == 0:
             ends, (work, lost_to_drag) = move(spheres, scene.material)
         else:
             material = _with_surfaces(scene.material)
@@ -581,12 +581,12 @@ def _material_by_replica(
     """
     c = tangents.log_temperature
     one = jnp.ones_like(tangents.elapsed)
-    by_clock = jax.jvp(partial(_faster, material), (one,), (-0.5 * one,))[1]
+    by_delay = jax.jvp(partial(_faster, material), (one,), (-0.5 * one,))[1]
     rows = jax.tree.map(lambda x: jnp.broadcast_to(x, c.shape[1:]), material)
     slopes = jax.tree.map(
         lambda direction, change: direction[:, None] + c * change,
         _with_surfaces(tangents.directions),
-        by_clock,
+        by_delay,
     )
     return rows, slopes
 
@@ -662,5 +662,5 @@ def soft_records(state: SphereState, scene: SphereScene, replicas: int) -> Recor
             rate -= 2 * drag.rotational_rate * T_rot
         at_place["rotational_temperature"] = logs * T_rot[None]
         rates["rotational_temperature"] = rate
-    slopes = {name: x - rates[name][None] * projected.clock for name, x in at_place.items()}
+    slopes = {name: x - rates[name][None] * projected.delay for name, x in at_place.items()}
     return Records(values, with_dissipated_energy(rates, d), with_dissipated_energy(slopes, d))

@@ -286,10 +286,10 @@ def integrate(
         """Return velocities and spins after the tangential kicks of walls, one axis after the
         other, and the energy that each member lost."""
         lost = jnp.zeros(len(spin), spin.dtype)
-        for axis, along in enumerate(jnp.eye(v.shape[1], dtype=v.dtype)):
-            towards = outwards[:, axis, None] * along[None]
+        for axis, unit in enumerate(jnp.eye(v.shape[1], dtype=v.dtype)):
+            towards = outwards[:, axis, None] * unit[None]
             lever = 1 - 2 * depth[:, axis]  # distance from the wall
-            slip = v * (1 - along)[None] + lever[:, None] * surface_direction(spin, towards)
+            slip = v * (1 - unit)[None] + lever[:, None] * surface_direction(spin, towards)
             across = jax.tree.map(lambda x, axis=axis: x[:, axis], push)
             response = 1 + lever**2 / surface.inertia
             kick, taken = tangential_kick(slip, across, walls_material.surface, response, dt)
