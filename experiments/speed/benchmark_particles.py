@@ -1,7 +1,7 @@
 """How fast are the particle models, compared with LAMMPS, and what do elements of a scene cost?
 
-    python experiments/speed/benchmark_particles.py [--only particles hard_spheres dsmc elements
-        elements_soft] [--smoke] [--record] [--out DIR]
+    python experiments/speed/benchmark_particles.py [--only particles hard_spheres dsmc references
+        batches elements elements_soft] [--smoke] [--record] [--out DIR]
 
 particles: soft spheres and LAMMPS simulate the same initial state for the same time with the same
 time step (the step of jaxgran increases a little as the gas cools). jaxgran counts the collisions;
@@ -16,6 +16,13 @@ Small gases are run several times in each repeat, as a single run is too short t
 
 dsmc: a homogeneous gas of viscoelastic spheres.
 
+references: hard spheres and DSMC beside plain C on one core, hard_spheres.c and dsmc.c of this
+folder, which `cc` compiles. Both sides run alternately; `ratio` is the median of the ratios of
+collisions per second, C over jaxgran.
+
+batches: `jax.jit(jax.vmap(...))` over values of A beside the curves one by one, in compiled code,
+too; `ratio` is how many times as fast each curve of a batch is.
+
 elements, elements_soft: beads (phi = .05, beta_T0 = .15) cool for some mean free times, with each
 element that a model supports, in turn. The ratio of the time per collision to that of the smooth
 gas, since gases with other losses make other numbers of collisions (for kinetic theory, of the time
@@ -28,6 +35,7 @@ import importlib.util
 import itertools
 import pickle
 import shutil
+import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -155,6 +163,100 @@ def dsmc(options: Options) -> Iterator[dict]:
         yield row | rates(gas, size, run(), run_s)
 
 
+C_PROGRAMS = Path(__file__).parent
+RESTITUTION, DISSIPATION = 0.9, 0.3
+"""Constant eps, and the dissipation parameter of viscoelastic spheres at the speed 1 in C."""
+
+
+def references(options: Options) -> Iterator[dict]:
+    hard_sizes, dsmc_sizes, repeats = (256, 4096, 50_000), (10_000, 1_000_000), 7
+    if options.smoke:
+        hard_sizes, dsmc_sizes, repeats = (256,), (10_000,), 1
+    with tempfile.TemporaryDirectory() as folder:
+        hard = compiled_by_c("hard_spheres", folder)
+        for size, phi in itertools.product(hard_sizes, (0.05, 0.25)):
+            each = 40 if size < 10_000 else 8  # collisions per sphere
+            command = hard, size, phi, each, RESTITUTION
+            start = cool(hard_beads(phi, RESTITUTION), [0.0], jaxgran.HardSpheres(size)).particles
+            model = jaxgran.HardSpheres(size, start=start)
+            row = {"program": "hard spheres", "num_particles": size, "packing_fraction": phi}
+            yield row | beside_c(command, hard_beads(phi, RESTITUTION), model, each, repeats)
+        direct = compiled_by_c("dsmc", folder)
+        for size, viscoelastic in itertools.product(dsmc_sizes, (False, True)):
+            each = 100 if size < 100_000 else 10
+            gas = beads(PACKING, DISSIPATION) if viscoelastic else hard_beads(PACKING, RESTITUTION)
+            command = direct, size, each, -DISSIPATION if viscoelastic else RESTITUTION
+            row = {"program": "DSMC", "num_particles": size, "viscoelastic": viscoelastic}
+            yield row | beside_c(command, gas, jaxgran.DSMC(size), each, repeats)
+
+
+def compiled_by_c(name: str, folder: str) -> str:
+    program = str(Path(folder) / name)
+    source = C_PROGRAMS / f"{name}.c"
+    subprocess.run(["cc", "-O3", "-march=native", source, "-lm", "-o", program], check=True)
+    return program
+
+
+def beside_c(command: tuple, gas: jaxgran.Gas, model, each: int, repeats: int) -> dict:
+    """Return collisions per second of C and of a model, which run alternately.
+
+    Args:
+        command: of the program in C.
+        gas, model: the same gas.
+        each: collisions per particle.
+        repeats: of both.
+    """
+    end = times_of(gas, [each])
+    run = partial(cool, gas, end, model)
+    set_up = partial(cool, gas, [0.0], model)
+    made = float(run().collisions[-1]) * model.num_particles / 2  # and compile
+    set_up()
+    by_c, ours = [], []
+    for _ in range(repeats):
+        printed = subprocess.run(list(map(str, command)), capture_output=True, check=True).stdout
+        collisions, took, _ = map(float, printed.split())
+        by_c.append(collisions / took)
+        (run_s,), (set_up_s,) = alternately({"run": run, "set-up": set_up}, 1).values()
+        ours.append(made / (run_s - set_up_s))
+    ratios = np.array(by_c) / np.array(ours)
+    rates = {"c_per_s": float(np.median(by_c)), "collisions_per_s": float(np.median(ours))}
+    return rates | {"ratio": float(np.median(ratios)), "ratios": ratios}
+
+
+def batches(options: Options) -> Iterator[dict]:
+    gas, repeats = beads(0.05, BETA), 1 if options.smoke else 7
+    models = {10: [jaxgran.KineticTheory()]}
+    if not options.smoke:
+        particles = jaxgran.HardSpheres(256), jaxgran.SoftSpheres(256), jaxgran.DSMC(2000)
+        models = {100: [jaxgran.KineticTheory()], 1000: [jaxgran.KineticTheory()], 8: particles}
+    for count, some in models.items():
+        for model in some:
+            yield batch_row(beads(0.05, BETA, 0.01), gas, model, count, repeats)
+
+
+def batch_row(soft: jaxgran.Gas, gas: jaxgran.Gas, model, count: int, repeats: int) -> dict:
+    gas = soft if isinstance(model, jaxgran.SoftSpheres) else gas
+    last = 20.0 if model.stochastic else 1e3
+    times = np.geomspace(1e-2, last, 50) * float(gas.mean_free_time)
+    sized = model.sized_for(gas) if hasattr(model, "sized_for") else model
+    values = gas.dissipative_constant * np.linspace(0.7, 1.3, count)
+
+    def curve(A):
+        return jaxgran.cool(gas.replace(dissipative_constant=A), times, model=sized).temperature
+
+    one, all_at_once = jax.jit(curve), jax.jit(jax.vmap(curve))
+
+    def one_by_one() -> None:
+        for A in values:
+            jax.block_until_ready(one(A))
+
+    runs = {"one by one": one_by_one, "batch": lambda: jax.block_until_ready(all_at_once(values))}
+    took = alternately(runs, 1 + repeats)  # the first ones compile
+    loop_s, batch_s = (np.array(each[1:]) for each in took.values())
+    row = {"model": model.name, "batch": count, "batch_s": float(np.median(batch_s))}
+    return row | {"loop_s": float(np.median(loop_s)), "ratio": float(np.median(loop_s / batch_s))}
+
+
 def elements_of(
     models: list, smoke: bool, size: int, contact_fraction: float | None
 ) -> Iterator[dict]:
@@ -207,4 +309,5 @@ def elements_soft(options: Options) -> Iterator[dict]:
 
 
 if __name__ == "__main__":
-    run_parts(__doc__, particles, hard_spheres, dsmc, elements, elements_soft, prefix="benchmark_")
+    parts = particles, hard_spheres, dsmc, references, batches, elements, elements_soft
+    run_parts(__doc__, *parts, prefix="benchmark_")
