@@ -292,9 +292,11 @@ def output_files(name: str, options: FitOptions) -> tuple[Path, Path]:
     stem = f"{name}-{options.model}"
     folder = options.out
     if folder is None:
-        folder, i = Path("results") / stem, 2
+        folder = Path("results") / stem
+        i = 2
         while folder.exists():
-            folder, i = Path("results") / f"{stem}-{i}", i + 1
+            folder = Path("results") / f"{stem}-{i}"
+            i += 1
     existing = next(part for part in (folder, *folder.absolute().parents) if part.exists())
     if not existing.is_dir() or not os.access(existing, os.W_OK):
         raise ValueError(f"{existing} is not a writable folder. Name another one with --out.")

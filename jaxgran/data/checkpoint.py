@@ -120,7 +120,8 @@ def load(path: str | Path, scene: dict[str, str], like: Any) -> Any:
     try:
         line, _, body = Path(path).read_bytes().partition(b"\n")
         header = json.loads(line)
-        old, digest = dict(header["scene"]), header["digest"]
+        old = dict(header["scene"])
+        digest = header["digest"]
     except (OSError, ValueError, TypeError, LookupError, RecursionError) as error:
         raise ValueError(
             f"{path} is not a jaxgran checkpoint ({error}). Name another file, or remove it"

@@ -23,7 +23,9 @@ MAX_SIGMAS = 5.0
 """Largest distance of a measured restitution outside its range, in standard errors, that is taken
 for chance."""
 
-SPHERE, PLATE, WALL = "sphere", "plate", "wall"
+SPHERE = "sphere"
+PLATE = "plate"
+WALL = "wall"
 PARTNERS = (SPHERE, PLATE, WALL)
 """What a sphere meets: an equal one, a thick plate of its material, or a wall of the container."""
 

@@ -234,7 +234,8 @@ def _ask_about_start(
     header = {"t0": "0", "T0_err": "0"} | header
     positive = above_noise(curve)
     times = np.asarray(curve.times)[positive] - files.header_number(header, "t0")
-    T, T0 = np.asarray(curve.temperature)[positive], float(gas.temperature)
+    T = np.asarray(curve.temperature)[positive]
+    T0 = float(gas.temperature)
     if len(T) < MIN_POINTS:
         return
     rows = slice(0, max(4, int(np.sum(0.4 * T[0] < T))))

@@ -177,7 +177,8 @@ def read_table(
     header: dict[str, str] = {}
     names: list[str] = []
     rows: dict[int, list[str]] = {}
-    separator, first = "", 0
+    separator = ""
+    first = 0
     text = read_text(path, wanted).replace("\r\n", "\n").replace("\r", "\n")
     for i, line in enumerate(text.split("\n"), start=1):
         bare = line.strip(' "\t,;|')
@@ -189,7 +190,8 @@ def read_table(
                     f"line {i} begins with {bare[0]!r}: header lines and comments begin with # or %"
                 )
             separator = next((mark for mark in SEPARATORS if mark in line), " ")
-            first, names = i, _names(i, line, separator, wanted)
+            first = i
+            names = _names(i, line, separator, wanted)
         elif bare:
             rows[i] = _split(line, separator, len(names))
     if not names:
@@ -477,7 +479,8 @@ def _value_and_error(text: str) -> tuple[str, str]:
         return f"{number}{exponent}{unit}", f"{error}{exponent}{unit}"
     behind = ""
     if (bracketed := _BRACKETED.fullmatch(text)) and _PLUS_MINUS.search(bracketed[1]):
-        text, behind = bracketed[1].strip(), f" {bracketed[2].strip()}"
+        text = bracketed[1].strip()
+        behind = f" {bracketed[2].strip()}"
     parts = _PLUS_MINUS.split(text)
     numbers = [_NUMBER_AND_UNIT.fullmatch(part) for part in parts]
     if len(parts) != 2 or not all(numbers):

@@ -32,7 +32,9 @@ UNBOUNDED = 1e3
 MIN_PARTICLES = 50
 """Particles of a model from which on the noise of its curves is known."""
 
-DETERMINED, NOT_DETERMINED, NOT_CONSISTENT = "determined", "not determined", "not consistent"
+DETERMINED = "determined"
+NOT_DETERMINED = "not determined"
+NOT_CONSISTENT = "not consistent"
 """Grades of `Fit.grade`."""
 
 MESSAGES = {
@@ -338,12 +340,14 @@ def _alternatives(result: Fit, absent: tuple[str, ...], quick: bool) -> Iterator
         yield say("of particles")
     estimate = float(result.estimate[0])
     for alternative in result.alternatives:
-        low, high = float(alternative.low[0]), float(alternative.high[0])
+        low = float(alternative.low[0])
+        high = float(alternative.high[0])
         span = _range(result, low, high)
         if alternative.restitution is not None:
             span = say("no meaning", eps=alternative.restitution)
         if alternative.preferred:
-            name, improvement = alternative.name, alternative.improvement
+            name = alternative.name
+            improvement = alternative.improvement
             yield say("is preferred", name=name, improvement=improvement, range=span)
             if not low <= estimate <= high:
                 yield say("outside", estimate=estimate)

@@ -241,7 +241,8 @@ def error_model_of_curve(
     scales = _scales(gas, pad_to(temperature, grid_size(size)))
     scales = {name: np.asarray(value)[:size] for name, value in scales.items()}
     values = {name: np.asarray(value, float) for name, value in (values | scales).items()}
-    critical, flow = values.pop("critical_box"), np.zeros_like(values["time"])
+    critical = values.pop("critical_box")
+    flow = np.zeros_like(values["time"])
     scatter = flow
     if num_particles is not None:
         flow, scatter = flow_share(gas, values["log_temperature"], critical, num_particles)

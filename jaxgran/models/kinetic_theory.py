@@ -249,7 +249,8 @@ class KineticTheory(AbstractModel):
         >>> [round(float(error), 4) for error in jnp.sqrt(jnp.diag(covariance))]
         [0.0089, 0.0151, 0.0237, 0.0262]
         """
-        gas, times = checks.checked_gas(gas), validation.checked_times(times)
+        gas = checks.checked_gas(gas)
+        times = validation.checked_times(times)
         num_particles = validation.checked_int("num_particles", num_particles, 1)
         self.check_scene(gas)
         if rotation and gas.surface is None:
@@ -428,7 +429,8 @@ class KineticTheory(AbstractModel):
     def _is_sound(self, gas: Gas) -> Bool[Array, ""]:
         sound = jnp.asarray(True)
         if "softness" in self.corrections:
-            law, hottest = gas.reduced_law, jnp.ones_like(gas.temperature)
+            law = gas.reduced_law
+            hottest = jnp.ones_like(gas.temperature)
             sound = softness_factor(law, hottest, gas.dimension) > 0
         if gas.diameter_sd is None:
             return sound

@@ -512,7 +512,8 @@ def scaled_critical_wavenumber(
     packing_fraction: Float[Array, ""], dimension: int
 ) -> Float[Array, ""]:
     """Critical wavenumber ``k_c sigma/sqrt(I)``, with I = <1 - eps^2>; see `Gas.critical_box`."""
-    g_2, phi = contact_value(packing_fraction, dimension), packing_fraction
+    g_2 = contact_value(packing_fraction, dimension)
+    phi = packing_fraction
     b, first, second = SHEAR_VISCOSITY[dimension]
     y = b * phi * g_2
     dense = g_2**2 / (1 + first * y + second * y**2)
@@ -645,7 +646,9 @@ def reduced_scene(gas: Gas) -> ReducedScene:
     ``Z = 1 + 2^(d-1) phi g_2`` is the pressure of elastic spheres over that of a dilute gas. Hence
     a sphere hits the walls ``Z sum_k 2/(L_k - sigma) sqrt(T/(2 pi))`` times a second.
     """
-    d, length, speed = gas.dimension, gas.path_length, gas.impact_speed
+    d = gas.dimension
+    length = gas.path_length
+    speed = gas.impact_speed
     surface = walls = drag = drive = None
     if isinstance(gas.surface, elements.Rough):
         rough = gas.surface
@@ -675,7 +678,8 @@ def _reduced_sizes(gas: Gas, spread: Float[Array, ""]) -> ReducedSizes:
     d = gas.dimension
     diameters = jnp.stack([1 - spread, 1 + spread])
     a, b = diameters[jnp.array(PAIRS).T]
-    radius, mass = 2 * a * b / (a + b), 2 * (a * b) ** 3 / (a**3 + b**3)
+    radius = 2 * a * b / (a + b)
+    mass = 2 * (a * b) ** 3 / (a**3 + b**3)
 
     def law(radius: Array, mass: Array) -> laws.ReducedLaw:
         return gas.law.reduced(
@@ -781,7 +785,9 @@ class SphereScene(NamedTuple):
 
 def sphere_scene(gas: Gas, num_particles: int, material: ReducedScene) -> SphereScene:
     """Return N spheres in a box, with the law, the surface and the walls of a material."""
-    side, container, nu = gas.box_side(num_particles) / gas.diameter, None, gas.collision_frequency
+    side = gas.box_side(num_particles) / gas.diameter
+    container = None
+    nu = gas.collision_frequency
     if gas.container is not None:
         container = jnp.broadcast_to(gas.container.side, (gas.dimension,)) / gas.diameter
         side = jnp.max(container) + 1

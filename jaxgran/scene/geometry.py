@@ -90,7 +90,8 @@ def pair_contact_value(
             two diameters, any shape.
         dimension: d, 2 or 3.
     """
-    phi, square = jnp.asarray(packing_fraction), jnp.asarray(spread) ** 2
+    phi = jnp.asarray(packing_fraction)
+    square = jnp.asarray(spread) ** 2
     rest = 1 - phi
     if dimension == 3:
         y = pair * (1 + square) / (1 + 3 * square)

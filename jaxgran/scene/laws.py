@@ -81,7 +81,8 @@ class RestitutionLaw(eqx.Module):
                 setattr(cls, name, eqx.field(converter=number_named(name), default=default))
 
     def __check_init__(self):
-        kind, base = type(self), RestitutionLaw
+        kind = type(self)
+        base = RestitutionLaw
         if kind.reduced is base.reduced and kind.restitution is base.restitution:
             raise ValueError(
                 f"{kind.__name__} has no restitution: define restitution(self, "
