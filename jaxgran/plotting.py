@@ -228,7 +228,7 @@ def _measured(result: Fit) -> CoolingCurve:
     if [*result.measurements] != [""]:
         raise ValueError(
             f"expected a fit of one curve, got one of {', '.join(result.measurements)}. Draw each "
-            "of these curves, and that of result.curve, by jaxgran.plot_curve."
+            "of these curves, and result.curve, by jaxgran.plot_curve."
         )
     return result.measurements[""].curve
 

@@ -132,7 +132,7 @@ class Fit:
     def standard_error(self) -> Float[np.ndarray, "p"]:
         """One standard deviation of each estimate, SI, from all known sources of error.
 
-        It holds if the scene contains nothing that the fit was not told of: see `ranges`.
+        It assumes that the scene has no effect that is missing in the measurement: see `ranges`.
         """
         return np.sqrt(np.diag(self.covariance))
 

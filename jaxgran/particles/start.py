@@ -239,7 +239,7 @@ def check_start(start: Particles | None, gas: Gas, replicas: int, num_particles:
             for s in (start.box_side, side)
         )
         raise ValueError(
-            f"start.box_side is {given} diameters, that of the gas {expected}. Change "
+            f"start.box_side is {given} diameters, but the box of the gas has {expected}. Change "
             "packing_fraction or the start"
         )
 
