@@ -97,7 +97,7 @@ def plot_fit(result: Fit, axes: Any = None) -> np.ndarray:
 
     Args:
         result: of `jaxgran.fit`, of one curve.
-        axes: two matplotlib axes, for T and for the residuals; by default those of a new figure.
+        axes: two matplotlib axes, for T and for the residuals; by default of a new figure.
 
     Returns:
         Both axes, shape (2,).

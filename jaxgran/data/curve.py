@@ -113,7 +113,7 @@ def _optional(unit: str) -> Any:
 class CoolingCurve(eqx.Module):
     """Temperature and further quantities of a cooling gas at given times, measured or computed.
 
-    All arrays have the shape of `times`; those of `replicas` have the shape (replicas, times).
+    All arrays have the shape of `times`; arrays of `replicas` have the shape (replicas, times).
     A quantity that is not known is None. Quantities with units of pint, astropy or unyt, and time
     differences, are converted to SI. A curve without a status counts as measured: its values are
     finite and positive. A value that has an error may be 0 or negative, as where noise was

@@ -141,7 +141,7 @@ def read_impacts(path: str | Path, header: dict[str, Any] | None = None) -> Impa
     Args:
         path: CSV file of tracks, see `jaxgran.read_measurement`. Particles keep their identity
             during impacts.
-        header: entries that count as those of the file. Needed are the keys of a gas, and
+        header: further entries of the header of the file. Needed are the keys of a gas, and
             frame_rate for frames without times; box_side unwraps positions; localisation_error is
             estimated without it; container_side and wall_restitution lead to impacts on walls,
             which must be parallel to the coordinates.
@@ -696,7 +696,7 @@ def _time_of_parting(
 
 
 def _scatter_about_lines(motion: _Motion, events: _Events, header: dict[str, str]) -> float:
-    """Return the localisation error: that of the header, or the scatter about straight flights."""
+    """Return the localisation error, from the header or the scatter about straight flights."""
     if "localisation_error" in header:
         return motion.error
     lines = _flights(motion, events)[0]

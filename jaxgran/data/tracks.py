@@ -19,7 +19,7 @@ from jaxgran.scene.geometry import sphere_mass
 COORDINATES = ("x", "y", "z")
 IDENTITIES = ("track_id", "id", "particle")
 CLOCKS = ("t", "frame")
-"""Names of columns of tracks, in order of preference; some are those of TrackMate and trackpy."""
+"""Names of columns of tracks, in order of preference; some are used by TrackMate and trackpy."""
 
 TRACK_KEYS = ("box_side", "frame_rate", "timestep", "localisation_error")
 """Header keys of tracks and trajectories."""
@@ -57,7 +57,7 @@ MAX_SWAPPED = 2e-3
 plane."""
 
 MAX_TAIL = 10.0
-"""Largest number of too long displacements, over that of Maxwellian speeds, without a warning."""
+"""Largest number of too long displacements, over the expected one, without a warning."""
 
 MIN_SIGMAS = 5.0
 """Least significance of what the displacements show, the errors of which are correlated."""
@@ -73,7 +73,7 @@ MAX_SONINE = 0.05
 
 
 HEADER_TOLERANCE = 0.01
-"""Largest relative difference of a number of a header from that of a trajectory."""
+"""Largest relative difference of a number in a header from the trajectory."""
 
 GSD_DEFAULT = 1.0
 """Diameter, in m, of GSD files that give none."""
@@ -86,7 +86,7 @@ class Step(NamedTuple):
         time: the middle of the two times, s.
         duration: s.
         ids: of the particles in both frames, increasing.
-        displacement: m, shape (n, d), without those of wrong identities.
+        displacement: m, shape (n, d), without wrong identities.
         left_out: numbers of displacements that are longer than the distribution allows, of those
             among them that are usual but for the difference of the extreme positions, and of
             further ones, of exchanged identities.
@@ -308,7 +308,7 @@ def _step(
     position: np.ndarray,
     side: float,
 ) -> Step:
-    """Return the displacements of particles without those of wrong identities.
+    """Return the displacements of particles, without wrong identities.
 
     Args:
         before, after: rows of the two frames.

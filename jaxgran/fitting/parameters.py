@@ -47,7 +47,7 @@ def domain_of(gas: Gas, name: str) -> Domain:
 
 
 def with_names_of_law(names: Any, gas: Gas) -> Any:
-    """Return names of free parameters with those of all parameters of the law in place of `LAW`."""
+    """Return names of free parameters, with all parameters of the law in place of `LAW`."""
     names = (names,) if isinstance(names, str) else names
     if not isinstance(names, tuple | list) or LAW not in names:
         return names
@@ -102,7 +102,7 @@ class Unknown(NamedTuple):
 
     @property
     def title(self) -> str:
-        """Name in a `Fit`: that of a parameter of one measurement begins with its label."""
+        """Name in a `Fit`, which begins with a label for a parameter of one measurement."""
         return self.name if not self.label else f"{self.label}: {self.name}"
 
 

@@ -55,7 +55,7 @@ class Fit:
             exclude; {} where the alternatives were not compared.
         alternatives: other explanations of the data, those that fit best first.
         chi2: sum of squares of all independent residuals of unit variance.
-        degrees_of_freedom: number of residuals minus that of the parameters.
+        degrees_of_freedom: number of residuals minus number of parameters.
         p_value: probability of residuals as large by chance, of the quantity that fits worst.
         smooth_p_value: probability of residuals as small by chance.
         log_likelihood: largest value of ln L, up to a constant.

@@ -136,7 +136,7 @@ def choose_model(
         num_particles: N of the gas, if known: gives the box, and the number of particles of a
             particle model (4000 if unknown). Without it the gas is assumed to stay homogeneous.
         replicas: number of replicas of a particle model.
-        models: the models to choose from, cheapest first; by default those of this package.
+        models: the models to choose from, cheapest first; by default all models of this package.
 
     Returns:
         `Choice`: the model, reasons in words, all candidates with their estimated errors. If no

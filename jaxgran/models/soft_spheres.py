@@ -78,7 +78,7 @@ class SoftSpheres(AbstractSpheres):
     A gas may have walls (of a `jaxgran.Viscoelastic` law: the same force, with the mass and radius
     of one sphere), where momentum is not conserved; drag, exact in the drift; and friction, also of
     walls (`jaxgran.Frictional`). The energy that they take counts as dissipated. In a step the
-    normal kicks of pairs come first, then those of walls, then those of tangential forces.
+    normal kicks of pairs come first, then normal kicks of walls, then tangential kicks.
 
     Args:
         num_particles: N in each box, >= 2; the box must be 2.1 diameters or longer. It lives on

@@ -41,7 +41,7 @@ COINCIDENT = 1e-9
 """Distance, in diameters, that is assumed between points at the same place."""
 
 SAME_BOX = 1e-6
-"""Relative difference up to which the box of a start counts as that of the gas."""
+"""Relative difference up to which a start is taken to have the box of the gas."""
 
 
 def maxwellian_velocities(

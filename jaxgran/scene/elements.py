@@ -316,7 +316,7 @@ VOLUME_TOLERANCE = 0.02
 
 
 def container_volume_ratio(gas: Any, num_particles: int | float) -> float:
-    """Ratio of the volume of N spheres at the gas's number density to that of its container."""
+    """Ratio of two volumes: of N spheres at the gas's number density, and of its container."""
     sides = np.broadcast_to(gas.container.side, (gas.dimension,))
     return float(num_particles / gas.number_density) / float(np.prod(sides))
 

@@ -65,7 +65,7 @@ _PACKING_DOMAINS = {d: Domain(0.0, close) for d, close in CLOSE_PACKING.items()}
 def _checked_law(law: laws.RestitutionLaw) -> laws.RestitutionLaw:
     if not isinstance(law, laws.RestitutionLaw):
         raise ValueError(f"law must be a restitution law such as jaxgran.Viscoelastic, got {law!r}")
-    # Functions in a law, as those of a neural network, must not be leaves beside its arrays.
+    # Functions in a law, as in a neural network, must not be leaves beside its arrays.
     law = jax.tree.map(_without_function_leaf, law)
     laws.check_reduced_units(law)
     return law
@@ -118,7 +118,7 @@ def optional_element(name: str) -> Any:
 
 
 MAX_SIZE_SPREAD = 0.2
-"""Largest standard deviation of diameters over their mean: that of two sizes 1 : 1.5."""
+"""Largest standard deviation of diameters over their mean: two sizes 1 : 1.5 have it."""
 
 
 def _optional_number(name: str) -> Any:
@@ -606,7 +606,7 @@ class ReducedSizes(NamedTuple):
 
     @property
     def masses(self) -> Float[Array, "2"]:
-        """Masses of small and large spheres, over that of a sphere of the mean diameter."""
+        """Masses of small and large spheres, over the mass of a sphere of the mean diameter."""
         return jnp.stack([1 - self.spread, 1 + self.spread]) ** 3
 
 
@@ -643,8 +643,8 @@ def reduced_scene(gas: Gas) -> ReducedScene:
     """Return a gas of impacts with rates in the unit of time `path_length` over `impact_speed`.
 
     The density of centres at a hard wall is Z times the mean density (contact theorem). Here
-    ``Z = 1 + 2^(d-1) phi g_2`` is the pressure of elastic spheres over that of a dilute gas. Hence
-    a sphere hits the walls ``Z sum_k 2/(L_k - sigma) sqrt(T/(2 pi))`` times a second.
+    ``Z = 1 + 2^(d-1) phi g_2`` is the pressure of elastic spheres over the pressure of a dilute
+    gas. Hence a sphere hits the walls ``Z sum_k 2/(L_k - sigma) sqrt(T/(2 pi))`` times a second.
     """
     d = gas.dimension
     length = gas.path_length
@@ -716,7 +716,7 @@ class ReducedContact(eqx.Module):
 
 
 class ReducedFriction(NamedTuple):
-    """Friction of contacts: `Frictional` in units of `sphere_scene`, or that of walls.
+    """Friction of contacts: `Frictional` in units of `sphere_scene`, or the friction of walls.
 
     Attributes:
         damping: x_t.

@@ -105,7 +105,7 @@ def contact_value_slopes(
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Logarithmic slopes of the pair correlation of hard spheres at contact.
 
-    The arguments are those of `contact_value`.
+    Arguments: see `contact_value`.
 
     Returns:
         Slope ``d ln g_2/d ln sigma = d phi g_2'/g_2`` at fixed number density.

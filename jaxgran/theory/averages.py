@@ -80,7 +80,7 @@ def _impact_nodes(dimension: int) -> tuple[Float[np.ndarray, "nodes"], ...]:
 
 
 def _term_coefficients(bilinear: np.ndarray, dimension: int, order: int) -> np.ndarray:
-    """Coefficients of `TERMS` from those of the products a_i a_j, with a_4 by its closure."""
+    """Coefficients of `TERMS` from coefficients of a_i a_j, with a_4 by its closure."""
     pairs = bilinear + np.swapaxes(bilinear, -1, -2)
     one = pairs[..., 0, :]
     square = bilinear[..., 1, 1]
@@ -524,7 +524,7 @@ def _chebyshev(num_nodes: int) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def _derivative_matrix(num_nodes: int) -> np.ndarray:
-    """Matrix from the coefficients of a Chebyshev series to those of its derivative."""
+    """Matrix that takes the coefficients of a Chebyshev series to its derivative."""
     return np.pad(np.polynomial.chebyshev.chebder(np.eye(num_nodes)), ((0, 1), (0, 0)))
 
 

@@ -19,7 +19,7 @@ Given u the normal velocity of sphere i is Gaussian with the mean ``(T_i/w) u`` 
     Delta_i = (a_i^2 k^2 - 2 a_i k T_i/w) u^2 - 2 a_i k u xi,    xi Gaussian, <xi^2> = T_i T_j/w,
 
 and v_j^2 likewise with ``+ 2 a_j k u xi``: the deviation xi of the velocity of the centre exchanges
-energy between the two. eps is that of equal spheres of the same effective radius and mass.
+energy between the two. Equal spheres of the same effective radius and mass have the same eps.
 
 Reference: Garzo & Dufty, Phys. Rev. E 60, 5706 (1999), for mixtures of constant restitution.
 """
