@@ -97,7 +97,7 @@ def plot_fit(result: Fit, axes: Any = None) -> np.ndarray:
 
     Args:
         result: of `jaxgran.fit`, of one curve.
-        axes: two matplotlib axes, for T and for the residuals; by default those of a new figure.
+        axes: two matplotlib axes, for T and for the residuals; by default of a new figure.
 
     Returns:
         Both axes, shape (2,).
@@ -228,7 +228,7 @@ def _measured(result: Fit) -> CoolingCurve:
     if [*result.measurements] != [""]:
         raise ValueError(
             f"expected a fit of one curve, got one of {', '.join(result.measurements)}. Draw each "
-            "of these curves, and that of result.curve, by jaxgran.plot_curve."
+            "of these curves, and result.curve, by jaxgran.plot_curve."
         )
     return result.measurements[""].curve
 

@@ -278,8 +278,8 @@ def _swept_names(gases: Gas) -> list[str]:
         return swept
     if sides == (gases.dimension,) and len(swept) < len(shapes):
         raise ValueError(
-            f"{WALL_SIDE} of shape {sides} is ambiguous: the sides of one box or those of "
-            f"{sides[0]} cubes. Give every parameter of gases an axis of members, as jax.vmap does."
+            f"{WALL_SIDE} of shape {sides} is ambiguous: one box with these sides, or {sides[0]} "
+            "cubes. Give every parameter of gases an axis of members, as jax.vmap does."
         )
     return [*swept, WALL_SIDE]
 

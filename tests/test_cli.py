@@ -142,7 +142,7 @@ def test_a_contradicting_drop_test_is_reported(fit):
     out, answer = fit("thin.csv", "dense.csv", "--drop-test", "others.csv")
     # N is not in the files: what speaks against A is that the curves need runs of 5 grains.
     assert not answer["agree"] and answer["p_value"] < 1e-3
-    assert "thin: the scatter is that of" in out
+    assert "thin: the curve scatters as" in out
     assert "contradict each other, or the model" in out
 
 

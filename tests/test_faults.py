@@ -48,7 +48,7 @@ def test_statuses_are_explained():
     words = jaxgran.explain_status(np.array([0, 32, 32 | 1]))
     assert "2 of 3 curves: the simulated time" in words and "1 of 3 curves: the neigh" in words
     for wrong in (-1, 1.5, "x", 2**15):
-        with pytest.raises(ValueError, match="status must be that of a curve"):
+        with pytest.raises(ValueError, match="status must come from a curve"):
             jaxgran.explain_status(wrong)
 
 

@@ -299,7 +299,7 @@ CALLS = [
     ),
     (
         lambda: cool(between_walls(GAS.box_side(24)), model=SOFT),
-        "of packing_fraction 0.05 need a container 0.833",
+        "of packing_fraction 0.05 need 0.833",
     ),
     (lambda: jaxgran.Viscoelastic("5e7", 0.2, 1e-6), "got '5e7'"),
     (lambda: GAS.replace(mass=True), "mass must be a number"),

@@ -129,7 +129,7 @@ def explain(status: ArrayLike | None) -> str:
     bits = np.asarray(OK if status is None else status)
     if bits.dtype.kind not in "iu" or np.any(bits < 0) or np.any(bits >= 2 * FAULTS[-1].bit):
         raise ValueError(
-            "status must be that of a curve, whole numbers from 0 to "
+            "status must come from a curve: whole numbers from 0 to "
             f"{2 * FAULTS[-1].bit - 1}, got {status!r:.60}"
         )
     counts = [(fault, np.count_nonzero(bits & fault.bit)) for fault in FAULTS]

@@ -67,11 +67,11 @@ class FitOptions:
         replicas: Number of replicas (particle models only).
         key: Seed of the random initial state (particle models only).
         free: Parameters to fit; by default A, and T0 if T has no errors.
-        set: Header values KEY=VALUE that replace those of the file.
+        set: Header values KEY=VALUE that replace values of the file.
         out: Output folder; by default a new one in results.
         overwrite: Replace existing files in the output folder.
         absent: Effects that are known to be absent (walls, roughness, drag, friction), in addition
-            to those of the header line `# absent: walls`.
+            to the header line `# absent: walls`.
         quick: Leave out the search of alternative explanations, which takes most of the time.
         imitate: Number of simulated runs of the fitted scene that are fitted, too, to count how
             often the range holds the true value; 0 for none.

@@ -127,7 +127,7 @@ def what_to_measure_next(result: jaxgran.Fit) -> list[Section]:
 
 
 def read_all(paths: Sequence[Path], options: FitOptions) -> dict[str, jaxgran.Measurement]:
-    """Return the measurements of all files, by label; that of a single one is ""."""
+    """Return the measurements of all files, by label; a single one has the label ""."""
     given = parse_settings(options.set)
     measurements: dict[str, jaxgran.Measurement] = {}
     drops = {"onto": "plate"} if options.onto_plate else {}
@@ -154,7 +154,7 @@ def read_all(paths: Sequence[Path], options: FitOptions) -> dict[str, jaxgran.Me
 
 
 def with_absent(measurement: jaxgran.Measurement, absent: Sequence[str]) -> jaxgran.Measurement:
-    """Return a measurement with effects that are absent in addition to those of its header."""
+    """Return a measurement with further effects that are known to be absent."""
     header = dict(measurement.header)
     header["absent"] = " ".join((*measurement.absent, *absent))
     return dataclasses.replace(
@@ -292,9 +292,11 @@ def output_files(name: str, options: FitOptions) -> tuple[Path, Path]:
     stem = f"{name}-{options.model}"
     folder = options.out
     if folder is None:
-        folder, i = Path("results") / stem, 2
+        folder = Path("results") / stem
+        i = 2
         while folder.exists():
-            folder, i = Path("results") / f"{stem}-{i}", i + 1
+            folder = Path("results") / f"{stem}-{i}"
+            i += 1
     existing = next(part for part in (folder, *folder.absolute().parents) if part.exists())
     if not existing.is_dir() or not os.access(existing, os.W_OK):
         raise ValueError(f"{existing} is not a writable folder. Name another one with --out.")

@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command. Invalid input gives one line on stderr and the exit code 2, Ctrl-C 130.
 
     Args:
-        arguments: of the command line, by default those of this process.
+        arguments: of the command line, by default of this process.
 
     Returns:
         The exit code.
@@ -130,7 +130,7 @@ def plan(
             file of a measured curve: the plan starts at its fit.
         free: Parameters to fit, the first of which is planned for; by default A, and T0 if T has
             no errors.
-        set: Header values KEY=VALUE of a CSV file that replace those of the file.
+        set: Header values KEY=VALUE that replace values of a CSV file.
         out: Picture to write, by default NAME-plan.png; the JSON file has the same name with .json.
         overwrite: Replace existing files.
         report: Write a web page with the table and the picture, too; needs the extra `report`.
@@ -163,7 +163,7 @@ def cool(
         scene: TOML file with eta, diameter, density, Y, nu, T0 and A (SI; eps, a constant
             restitution, may replace Y, nu and A), or the CSV file of a curve with these keys in its
             header.
-        until: Last time, s; needed for a TOML file, by default the times are those of the CSV file.
+        until: Last time, s; needed for a TOML file, by default the times of the CSV file.
         model: Model to use.
         particles: Number of particles per replica (particle models only; default: N from the
             scene).
@@ -214,7 +214,7 @@ def choose(
         scene: TOML file with eta, diameter, density, Y, nu, T0 and A (SI), and N for a gas in a
             box, or the CSV file of a curve with these keys in its header. Without A that of a fit
             of the curve is used.
-        until: Last time, s; needed for a TOML file, by default that of the CSV file.
+        until: Last time, s; needed for a TOML file, by default the last time of the CSV file.
         tolerance: Allowed relative error of T.
         no_cache: Disable the compilation cache (same as JAXGRAN_NO_CACHE=1).
     """

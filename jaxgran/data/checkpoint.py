@@ -120,7 +120,8 @@ def load(path: str | Path, scene: dict[str, str], like: Any) -> Any:
     try:
         line, _, body = Path(path).read_bytes().partition(b"\n")
         header = json.loads(line)
-        old, digest = dict(header["scene"]), header["digest"]
+        old = dict(header["scene"])
+        digest = header["digest"]
     except (OSError, ValueError, TypeError, LookupError, RecursionError) as error:
         raise ValueError(
             f"{path} is not a jaxgran checkpoint ({error}). Name another file, or remove it"
@@ -143,7 +144,7 @@ def load(path: str | Path, scene: dict[str, str], like: Any) -> Any:
 
 
 def _described(scene: dict[str, str], tree: Any) -> dict[str, str]:
-    """Return a description of a run with that of its state, such as "float64(3, 2)"."""
+    """Return a description of a run and of its state, such as "float64(3, 2)"."""
     words = [f"{getattr(x, 'dtype', type(x).__name__)}{np.shape(x)}" for x in jax.tree.leaves(tree)]
     made_by = {"format": FORMAT, "version of jaxgran": version("jaxgran")}
     return made_by | scene | {"types and shapes of the state": ", ".join(words)}

@@ -113,7 +113,7 @@ def _optional(unit: str) -> Any:
 class CoolingCurve(eqx.Module):
     """Temperature and further quantities of a cooling gas at given times, measured or computed.
 
-    All arrays have the shape of `times`; those of `replicas` have the shape (replicas, times).
+    All arrays have the shape of `times`; arrays of `replicas` have the shape (replicas, times).
     A quantity that is not known is None. Quantities with units of pint, astropy or unyt, and time
     differences, are converted to SI. A curve without a status counts as measured: its values are
     finite and positive. A value that has an error may be 0 or negative, as where noise was
@@ -312,7 +312,8 @@ class CoolingCurve(eqx.Module):
             each: tree of arrays of shape (replicas, times, ...).
         """
         assert self.replicas is not None
-        error, count = None, len(self.replicas.temperature)
+        error = None
+        count = len(self.replicas.temperature)
         if count > 1:
             each_held = jax.lax.stop_gradient(each)
             error = jax.tree.map(lambda x: jnp.std(x, axis=0, ddof=1) / count**0.5, each_held)
@@ -475,7 +476,10 @@ def import_extra(name: str, extra: str = "notebook") -> Any:
         ) from None
 
 
-TIME, REPLICA, STATUS, SAVED = "time", "replica", "status", "saved"
+TIME = "time"
+REPLICA = "replica"
+STATUS = "status"
+SAVED = "saved"
 OF_REPLICAS = "_of_replicas"
 """Ending of the names of arrays that have an axis of replicas."""
 

@@ -91,7 +91,7 @@ def read_data(path: Path, given: dict[str, str]) -> Content:
 
     Args:
         path: the file.
-        given: entries that count as those of its header.
+        given: further entries of its header.
     """
     if path.suffix == ARCHIVE_SUFFIX:
         curve, header = _read_archive(path)

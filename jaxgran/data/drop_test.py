@@ -23,7 +23,9 @@ MAX_SIGMAS = 5.0
 """Largest distance of a measured restitution outside its range, in standard errors, that is taken
 for chance."""
 
-SPHERE, PLATE, WALL = "sphere", "plate", "wall"
+SPHERE = "sphere"
+PLATE = "plate"
+WALL = "wall"
 PARTNERS = (SPHERE, PLATE, WALL)
 """What a sphere meets: an equal one, a thick plate of its material, or a wall of the container."""
 
@@ -150,7 +152,7 @@ class DropTest(eqx.Module):
         return int(np.size(self.restitution)) * (1 + self.is_oblique)
 
     def errors_of_ratio(self) -> Float[np.ndarray, "n"]:
-        """Return the standard error of each eps, with that of the speed before the impact."""
+        """Return the standard error of each eps, the error of the speed before included."""
         return np.asarray(self._error_with(np.asarray(self.restitution)))
 
     def _error_with(self, slope: Array | np.ndarray) -> Float[Array, "n"]:
@@ -221,7 +223,7 @@ class DropTest(eqx.Module):
     def residuals(self, gas: Gas) -> Float[Array, "values"]:
         """Return measured minus computed restitution over the error, for spheres of a gas.
 
-        The values of eps are followed by those of eps_t.
+        The values of eps come first, then eps_t.
         """
         normal = (jnp.asarray(self.restitution) - self.computed(gas)) / self.errors(gas)
         if not self.is_oblique:

@@ -199,7 +199,8 @@ def make_gas(header: dict[str, str]) -> Gas:
         **elements_of_header(header),
     )
     if gas.container is not None and "N" in header:
-        number, eta = files.header_number(header, "N"), float(gas.packing_fraction)
+        number = files.header_number(header, "N")
+        eta = float(gas.packing_fraction)
         ratio = container_volume_ratio(gas, number)
         if abs(ratio - 1) > VOLUME_TOLERANCE:
             raise ValueError(
@@ -257,7 +258,8 @@ def elements_of_header(header: dict[str, str]) -> dict[str, Any]:
                 f"the header gives {key}: {reason}. No model of jaxgran supports it; fit a curve "
                 f"of equal spheres without it, and leave {key} out{advice}"
             )
-    lasting, rough = "tangential_damping" in header, "beta_t" in header
+    lasting = "tangential_damping" in header
+    rough = "beta_t" in header
     if lasting and rough:
         raise ValueError(
             "the header gives both beta_t (instantaneous impacts) and tangential_damping (lasting "

@@ -66,7 +66,7 @@ def drop_test_columns(names: list[str]) -> list[str]:
     if sorted({*names} - {*further}) != sorted(wanted) or len({*names}) < len(names):
         optional = f", and where known {', '.join(further)}" if further else ""
         raise ValueError(
-            f"the columns are {', '.join(names)}; name those of a drop test {','.join(wanted)}"
+            f"the columns are {', '.join(names)}; a drop test needs {','.join(wanted)}"
             f"{optional}, each once. Oblique impacts have v_n,v_t or v,angle with eps_t,eps_t_err, "
             "or velocities before and after"
         )

@@ -77,11 +77,11 @@ class Measurement(eqx.Module):
         absent: effects that are known to be absent, of "walls", "roughness", "drag" and "friction":
             a fit does not consider them as explanations of the curve.
         tracked: number of grains of each run that T is the mean of, if it is less than N: T then
-            has a sampling error in addition. None if T is that of all grains.
+            has a sampling error in addition. None if T is the mean over all grains.
         ensemble_start: True if T_0 of the gas is that of an ensemble from which the velocities were
             drawn; False if it is that of the run itself.
         calibration_error: relative standard error of the scale of T, common to all times.
-        errors_measured: True if the errors of the data are those of the measurement. Errors of T of
+        errors_measured: True if the errors of the data are errors of measurement. Errors of T of
             one run that equal ``sqrt(2/(d N)) T`` are otherwise taken for the fluctuation of
             independent samples and left out, since the fluctuations of N grains are known.
         of_energy: True if T is that by the mean energy over the mean mass, ``<m v^2>/(d <m>)``, and
@@ -227,13 +227,13 @@ def read_measurement(
             numbers may have decimal commas.
             Trajectories with velocities (GSD, extended XYZ, LAMMPS dump) and npz files that
             `write_curve` writes are read, too.
-        header: entries that count as those of the file, before anything is read; they replace
-            entries with the same key. Keys are those of `jaxgran.data.header.gas_of_header` and
+        header: further entries of the header, before anything is read; they replace
+            entries with the same key. Keys: see `jaxgran.data.header.gas_of_header` and
             `priors_of_header`, N, replicas, absent, tracked, T0_of ("run" or "ensemble"),
             T_scale_err, errors ("measured"), which stand for the arguments of `Measurement`, those
             of drop tests, onto ("sphere", "plate" or "wall") and spin_before ("0"), and those of
             tracks.
-        gas: the gas in place of that of the header, such as that of a curve for a drop test.
+        gas: the gas in place of the header's, such as the gas of a curve for a drop test.
 
     Returns:
         `Measurement`. Unusual values, and columns that contradict the header, cause warnings,

@@ -162,9 +162,11 @@ def open_frames(path: Path) -> list[Callable[[int | None], Frame]]:
             return [partial(_read_gsd, path, k) for k in range(len(file))]
     text = read_bytes(path).decode("utf-8-sig")
     if text.lstrip().startswith("ITEM:"):
-        read, parts = _read_dump, _parts_of_dump(text)
+        read = _read_dump
+        parts = _parts_of_dump(text)
     elif text.split(maxsplit=1)[:1] and text.split(maxsplit=1)[0].isdigit():
-        read, parts = _read_xyz, _parts_of_xyz(text)
+        read = _read_xyz
+        parts = _parts_of_xyz(text)
     else:
         return [partial(_read_data, text)]
     frames: list[Any] = [partial(read, part) for part in parts]
@@ -226,11 +228,15 @@ def _frame(
         )
     if not columns.keys() & {"x", "xu"}:
         position = low + position * sides
-    sides, low = length * sides[:d], length * low[:d]
-    position, velocity = length * position[:, :d] - low, length / second * velocity
-    equal, different = {}, []
+    sides = length * sides[:d]
+    low = length * low[:d]
+    position = length * position[:, :d] - low
+    velocity = length / second * velocity
+    equal = {}
+    different = []
     for name in EQUAL.keys() & columns.keys():
-        powers, values = EQUAL[name], columns[name]
+        powers = EQUAL[name]
+        values = columns[name]
         if powers is None:
             is_equal = len(set(values)) <= 1
         else:
@@ -238,7 +244,8 @@ def _frame(
             is_equal = np.ptp(values) <= FLOAT32_TOLERANCE * np.max(np.abs(values))
         equal[name] = values
         different += [] if is_equal else [name]
-    is_periodic, moving = all(periodic[:d]), np.any(velocity, axis=0)
+    is_periodic = all(periodic[:d])
+    moving = np.any(velocity, axis=0)
     finite = all(np.all(np.isfinite(x)) for x in (position, velocity, sides))
     outside = np.any((position < 0) | (position > sides)) and not is_periodic
     in_plane = d == 3 and any(moving) and not moving[2] and np.ptp(position[:, 2]) == 0
@@ -272,7 +279,8 @@ def _read_gsd(path: Path, k: int, dimension: int | None) -> Frame:
         known = file.file.application.startswith("jaxgran") or file.file.chunk_exists(
             k, "particles/velocity"
         )
-    particles, box = snapshot.particles, snapshot.configuration
+    particles = snapshot.particles
+    box = snapshot.configuration
     sides, tilts = np.split(np.asarray(box.box, float), 2)
     if np.any(tilts != 0):
         raise ValueError(SLANTED)
@@ -284,13 +292,15 @@ def _read_gsd(path: Path, k: int, dimension: int | None) -> Frame:
     if spin is not None:
         spin = np.reshape(spin, (int(particles.N), -1)).T
         columns |= zip(SPIN[-len(spin) :], spin, strict=True)
-    time, dimension = None if time is None else float(time[0]), dimension or int(box.dimensions)
+    time = None if time is None else float(time[0])
+    dimension = dimension or int(box.dimensions)
     return _frame(columns, -sides / 2, sides, dimension, time=time, step=int(box.step))
 
 
 def _parts_of_dump(text: str) -> list[dict[str, tuple[list[str], str]]]:
     """Return words and lines of each item of each frame of a LAMMPS dump, by name."""
-    frames, items = [], {}
+    frames = []
+    items = {}
     for section in re.split(r"^ITEM: ", text, flags=re.MULTILINE)[1:]:
         head, _, body = section.partition("\n")
         name = next((name for name in DUMP_ITEMS if head.startswith(name)), head)
@@ -327,7 +337,9 @@ def _read_dump(items: dict[str, tuple[list[str], str]], dimension: int | None) -
 
 def _parts_of_xyz(text: str) -> list[list[str]]:
     """Return the lines of each frame of an extended XYZ file."""
-    lines, frames, at = text.splitlines(), [], 0
+    lines = text.splitlines()
+    frames = []
+    at = 0
     while at < len(lines):
         if not lines[at].strip():
             at += 1
@@ -531,7 +543,8 @@ def _append_xyz(path: Path, k: int, time: float, replica: Particles, sphere: Sph
     sides = np.broadcast_to(replica.box_side, d)
     lattice = np.diag([*sides, *[sphere.diameter] * (3 - d)]).ravel()
     columns = [np.zeros((n, 3)), np.zeros((n, 3)), np.full((n, 1), sphere.diameter / 2)]
-    columns[0][:, :d], columns[1][:, :d] = replica.position, replica.velocity
+    columns[0][:, :d] = replica.position
+    columns[1][:, :d] = replica.velocity
     names = "species:S:1:pos:R:3:velo:R:3:radius:R:1"
     if replica.angular_velocity is not None:
         columns.append(np.asarray(replica.angular_velocity))
@@ -547,13 +560,15 @@ def _append_xyz(path: Path, k: int, time: float, replica: Particles, sphere: Sph
 
 def _count_frames_xyz(path: Path) -> int:
     """Return the number of complete frames, and remove an incomplete last one from the file."""
-    frames, end = 0, 0
+    frames = 0
+    end = 0
     with path.open("rb+") as file:
         while (first := file.readline()).strip():
             lines = [file.readline() for _ in range(int(first) + 1)]
             if not lines[-1].endswith(b"\n"):
                 break
-            frames, end = frames + 1, file.tell()
+            frames += 1
+            end = file.tell()
         file.truncate(end)
     return frames
 

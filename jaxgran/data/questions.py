@@ -76,10 +76,10 @@ QUESTIONS = {
     "T0 is 1": "T0 is 1 m^2/s^2: is the temperature divided by its first value? Then give T0 in "
     "m^2/s^2, and multiply T by it",
     "large error": "{key}_err is {error:.6g} {unit}, more than {key}, {value:.6g}: a number "
-    "without a unit has that of {key}. Is it in {unit}? Then write it behind",
+    "without a unit is in the unit of {key}. Is it in {unit}? Then write it behind",
     # errors
     "T_err and N": "T_err is at least {ratio:.2g} times {word} than the scatter of T of N = "
-    "{number:g} particles in {replicas:g} run(s): are N, replicas and T_err those of this curve, "
+    "{number:g} particles in {replicas:g} run(s): do N, replicas and T_err belong to this curve, "
     "and is T_err a standard error of the mean?",
     "digits": "{column}_err, {error:.2g}, is less than the digits of {column} tell, "
     "{digit:.2g}/sqrt(12): the rounding counts as an error in addition. Write more digits of "
@@ -94,9 +94,9 @@ QUESTIONS = {
     "any unit of the header": "are t, eta, diameter and T0 in the units that the file says?",
     "steps": "; is it in steps or frames? Then multiply it by their duration",
     # the definition of T
-    "mean_speed": "mean_speed is taken for that of all three components. If it is of the two that "
-    "one camera sees, T is .62 times too small and A 37 % too large: name the column mean_speed_xy "
-    "then, and mean_speed_xyz otherwise",
+    "mean_speed": "mean_speed is read as the speed in three dimensions. If it contains only the "
+    "two components that one camera sees, T is .62 times too small and A 37 % too large: name the "
+    "column mean_speed_xy then, and mean_speed_xyz otherwise",
     "scale": "T is {first:.4g} at first, {ratio:.3g} times the header's T0 = {T0:g} m^2/s^2: "
     "{question}. If T is right, correct T0",
     "definition": "is the column {words}? Then {rename}multiply {what} by {factor:.6g}",
@@ -234,7 +234,8 @@ def _ask_about_start(
     header = {"t0": "0", "T0_err": "0"} | header
     positive = above_noise(curve)
     times = np.asarray(curve.times)[positive] - files.header_number(header, "t0")
-    T, T0 = np.asarray(curve.temperature)[positive], float(gas.temperature)
+    T = np.asarray(curve.temperature)[positive]
+    T0 = float(gas.temperature)
     if len(T) < MIN_POINTS:
         return
     rows = slice(0, max(4, int(np.sum(0.4 * T[0] < T))))

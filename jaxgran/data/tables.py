@@ -22,7 +22,7 @@ from jaxgran.data.files import read_bytes
 from jaxgran.scene.parameters import BY_SYMBOL
 
 UNIT_KEYS = {"length_unit": "m", "time_unit": "s", "speed_unit": "m/s"}
-"""Header keys of units, and the units that they replace. speed_unit is also that of T, squared."""
+"""Header keys of units, and the units that they replace. T is in the square of speed_unit."""
 
 HEADER_UNITS = {
     **UNIT_KEYS,
@@ -32,7 +32,7 @@ HEADER_UNITS = {
     "timestep": "s",
     "T_scale": "1",
 }
-"""Unit of each header key; that of a standard error, x_err, is that of x."""
+"""Unit of each header key; a standard error, x_err, has the unit of x."""
 
 COLUMN_UNITS = {
     **{quantity.column: quantity.unit for quantity in QUANTITIES.values()},
@@ -47,7 +47,7 @@ COLUMN_UNITS = {
     "angle": "deg",
     **dict.fromkeys(("eps", "eps_t", "eps_t_center"), "1"),
 }
-"""Unit of each column; that of a standard error, x_err, is that of x."""
+"""Unit of each column; a standard error, x_err, has the unit of x."""
 
 UNITS = HEADER_UNITS | COLUMN_UNITS
 
@@ -166,7 +166,7 @@ def read_table(
         wanted: the names of its columns, for messages.
         columns_to_read: from the names of the columns without units, those whose numbers are read;
             raises ValueError for wrong names.
-        given: entries of the header, with or without units, that replace those of the file.
+        given: entries of the header, with or without units, that replace entries of the file.
         identities: names of columns that identify particles: rows without a number there, as of
             particles that belong to no track, are left out.
 
@@ -177,7 +177,8 @@ def read_table(
     header: dict[str, str] = {}
     names: list[str] = []
     rows: dict[int, list[str]] = {}
-    separator, first = "", 0
+    separator = ""
+    first = 0
     text = read_text(path, wanted).replace("\r\n", "\n").replace("\r", "\n")
     for i, line in enumerate(text.split("\n"), start=1):
         bare = line.strip(' "\t,;|')
@@ -189,7 +190,8 @@ def read_table(
                     f"line {i} begins with {bare[0]!r}: header lines and comments begin with # or %"
                 )
             separator = next((mark for mark in SEPARATORS if mark in line), " ")
-            first, names = i, _names(i, line, separator, wanted)
+            first = i
+            names = _names(i, line, separator, wanted)
         elif bare:
             rows[i] = _split(line, separator, len(names))
     if not names:
@@ -312,7 +314,7 @@ def _decimal_comma(rows: dict[int, list[str]], at: list[int], separator: str) ->
 def _pop_head_rows(rows: dict[int, list[str]], names: list[str]) -> dict[int, str]:
     """Remove rows of words below the names; return units in brackets, by the place of the column.
 
-    Such rows are those of units, and further names above a row of units, as TrackMate writes them.
+    Such rows are units, and further names above a row of units, as TrackMate writes them.
     """
     head = []
     for i, row in rows.items():
@@ -477,7 +479,8 @@ def _value_and_error(text: str) -> tuple[str, str]:
         return f"{number}{exponent}{unit}", f"{error}{exponent}{unit}"
     behind = ""
     if (bracketed := _BRACKETED.fullmatch(text)) and _PLUS_MINUS.search(bracketed[1]):
-        text, behind = bracketed[1].strip(), f" {bracketed[2].strip()}"
+        text = bracketed[1].strip()
+        behind = f" {bracketed[2].strip()}"
     parts = _PLUS_MINUS.split(text)
     numbers = [_NUMBER_AND_UNIT.fullmatch(part) for part in parts]
     if len(parts) != 2 or not all(numbers):
@@ -523,7 +526,7 @@ def _factor(name: str, units_given: dict[str, str], units: dict[str, str], kind:
     """Return the value in SI of the unit of a name.
 
     Args:
-        name: of a column or a header key; a standard error without a unit has that of its value.
+        name: of a column or a header key; an error without a unit has the unit of its value.
         units_given: the units that stand behind names.
         units: the units of other numbers, by SI unit.
         kind: of the name, for messages.

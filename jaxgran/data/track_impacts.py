@@ -141,7 +141,7 @@ def read_impacts(path: str | Path, header: dict[str, Any] | None = None) -> Impa
     Args:
         path: CSV file of tracks, see `jaxgran.read_measurement`. Particles keep their identity
             during impacts.
-        header: entries that count as those of the file. Needed are the keys of a gas, and
+        header: further entries of the header of the file. Needed are the keys of a gas, and
             frame_rate for frames without times; box_side unwraps positions; localisation_error is
             estimated without it; container_side and wall_restitution lead to impacts on walls,
             which must be parallel to the coordinates.
@@ -496,7 +496,8 @@ def _encounters_with_walls(motion: _Motion, gas: Gas) -> _Events:
     d = motion.position.shape[1]
     assert gas.container is not None
     room = np.broadcast_to(np.asarray(gas.container.side), (d,)) - float(gas.diameter)
-    low, high = motion.position.min(axis=0), motion.position.max(axis=0)
+    low = motion.position.min(axis=0)
+    high = motion.position.max(axis=0)
     allowed = WALL_TOLERANCE * float(gas.diameter) + 2 * MAX_SIGMAS * motion.error
     if np.any(np.abs(high - low - room) > allowed):
         raise ValueError(
@@ -588,7 +589,8 @@ def _meeting(
     size = events.first.size
     is_wall = events.second < 0
     earlier, later, through = _flights(motion, events)
-    (i, j), (i_after, j_after) = earlier.of_events(size), later.of_events(size)
+    i, j = earlier.of_events(size)
+    i_after, j_after = later.of_events(size)
     to_second = np.where(is_wall, 0.0, 1.0)[:, None]
     g = i.velocity - to_second * j.velocity
     g_after = i_after.velocity - to_second * j_after.velocity
@@ -694,7 +696,7 @@ def _time_of_parting(
 
 
 def _scatter_about_lines(motion: _Motion, events: _Events, header: dict[str, str]) -> float:
-    """Return the localisation error: that of the header, or the scatter about straight flights."""
+    """Return the localisation error, from the header or the scatter about straight flights."""
     if "localisation_error" in header:
         return motion.error
     lines = _flights(motion, events)[0]
@@ -753,6 +755,8 @@ def _summary(
             "film at a higher rate, and check diameter and length_unit"
         )
     of_spheres = left & ~is_wall
-    first, second, times = events.first, events.second, meeting.time
+    first = events.first
+    second = events.second
+    times = meeting.time
     places = first[of_spheres], second[of_spheres], times[of_spheres]
     return Impacts(spheres, walls, counts, places, motion.error, header, gas)

@@ -19,7 +19,7 @@ from jaxgran.scene.geometry import sphere_mass
 COORDINATES = ("x", "y", "z")
 IDENTITIES = ("track_id", "id", "particle")
 CLOCKS = ("t", "frame")
-"""Names of columns of tracks, in order of preference; some are those of TrackMate and trackpy."""
+"""Names of columns of tracks, in order of preference; some are used by TrackMate and trackpy."""
 
 TRACK_KEYS = ("box_side", "frame_rate", "timestep", "localisation_error")
 """Header keys of tracks and trajectories."""
@@ -57,7 +57,7 @@ MAX_SWAPPED = 2e-3
 plane."""
 
 MAX_TAIL = 10.0
-"""Largest number of too long displacements, over that of Maxwellian speeds, without a warning."""
+"""Largest number of too long displacements, over the expected one, without a warning."""
 
 MIN_SIGMAS = 5.0
 """Least significance of what the displacements show, the errors of which are correlated."""
@@ -73,7 +73,7 @@ MAX_SONINE = 0.05
 
 
 HEADER_TOLERANCE = 0.01
-"""Largest relative difference of a number of a header from that of a trajectory."""
+"""Largest relative difference of a number in a header from the trajectory."""
 
 GSD_DEFAULT = 1.0
 """Diameter, in m, of GSD files that give none."""
@@ -86,7 +86,7 @@ class Step(NamedTuple):
         time: the middle of the two times, s.
         duration: s.
         ids: of the particles in both frames, increasing.
-        displacement: m, shape (n, d), without those of wrong identities.
+        displacement: m, shape (n, d), without wrong identities.
         left_out: numbers of displacements that are longer than the distribution allows, of those
             among them that are usual but for the difference of the extreme positions, and of
             further ones, of exchanged identities.
@@ -178,7 +178,9 @@ def curve_of_tracks(
         ValueError: for fewer than 3 particles or 4 frames, a particle twice in a frame, and
             positions that are wrapped into a box.
     """
-    steps, notes, questions = _steps(columns, header, lines), [], []
+    steps = _steps(columns, header, lines)
+    notes = []
+    questions = []
     usable = [step for step in steps if len(step.ids) >= MIN_TRACKS]
     if len(usable) < MIN_POINTS:
         number = len(np.unique(_identities(columns)))
@@ -187,7 +189,8 @@ def curve_of_tracks(
             f"in {len(steps) + 1} frames; at least {MIN_TRACKS} particles in {MIN_POINTS + 1} "
             "frames are needed to remove the drift and estimate errors"
         )
-    n, d = max(len(step.ids) for step in usable), usable[0].displacement.shape[1]
+    n = max(len(step.ids) for step in usable)
+    d = usable[0].displacement.shape[1]
     factor = _momentum_correction(n, d, header, notes)
     velocities = [step.displacement / step.duration for step in usable]
     T, error = np.transpose([_temperature_and_error(velocity) for velocity in velocities])
@@ -199,7 +202,8 @@ def curve_of_tracks(
             f"T by the mean square of the speeds is {100 * difference:+.2g} % from T by their "
             "median: identities may be wrong, or the gas may consist of unequal parts"
         )
-    T, error = factor * T, factor * error
+    T = factor * T
+    error = factor * error
     rate = _fit_memory(usable, T, header, gas, notes, questions)
     duration = np.array([step.duration for step in usable])
 
@@ -304,7 +308,7 @@ def _step(
     position: np.ndarray,
     side: float,
 ) -> Step:
-    """Return the displacements of particles without those of wrong identities.
+    """Return the displacements of particles, without wrong identities.
 
     Args:
         before, after: rows of the two frames.
@@ -312,13 +316,17 @@ def _step(
         side: of a box into which positions are wrapped, m; otherwise infinite.
     """
     shared, i, j = np.intersect1d(ids[before], ids[after], assume_unique=True, return_indices=True)
-    start, end = position[before[i]], position[after[j]]
-    lost, new = np.delete(position[before], i, axis=0), np.delete(position[after], j, axis=0)
+    start = position[before[i]]
+    end = position[after[j]]
+    lost = np.delete(position[before], i, axis=0)
+    new = np.delete(position[after], j, axis=0)
     if side < np.inf:
         end = end - side * np.round((end - start) / side)
-    first, last = float(t[before[0]]), float(t[after[0]])
+    first = float(t[before[0]])
+    last = float(t[after[0]])
     step = Step((first + last) / 2, last - first, shared.astype(int), end - start)
-    (n, d), chi2 = start.shape, scipy.stats.chi2
+    n, d = start.shape
+    chi2 = scipy.stats.chi2
     drift = np.median(step.displacement, axis=0) if n else 0.0
     start = start + drift
     scale = np.median(np.sum((end - start) ** 2, axis=1)) / chi2.median(d) if n else 0.0
@@ -329,7 +337,8 @@ def _step(
         return np.sum(moved**2, axis=1) / scale
 
     moved = end - start
-    own, limit = chi_squared(moved), chi2.isf(CHANCE / n, d)
+    own = chi_squared(moved)
+    limit = chi2.isf(CHANCE / n, d)
     too_long = own > limit
     spread = np.ptp(np.concatenate([start, end]), axis=0)
     folded = too_long & (chi_squared(moved - spread * np.round(moved / spread)) < chi2.isf(0.05, d))
@@ -380,7 +389,8 @@ def _ask_about_identities(
 
 def _difference_from_median(T: np.ndarray, velocities: list[np.ndarray]) -> tuple[float, float]:
     """Return the relative difference of T from that by the median speed, and its size by chance."""
-    d, chi2 = velocities[0].shape[1], scipy.stats.chi2
+    d = velocities[0].shape[1]
+    chi2 = scipy.stats.chi2
     squares = [np.sum((u - u.mean(axis=0)) ** 2, axis=1) for u in velocities]
     medians = [np.median(square) / chi2.median(d) for square in squares]
     share = float(np.mean(np.log(T / np.maximum(medians, np.finfo(float).tiny))))
@@ -473,7 +483,8 @@ def _fit_memory(
     if not given:
         both, errors = fit([*start, 0.05])
         if both[1] > MIN_SIGMAS * errors[1]:
-            found, error = both, errors
+            found = both
+            error = errors
             e = float(np.sqrt(both[1] * unit))
             header["localisation_error"] = repr(e)
             notes.append(f"localisation_error not given, and estimated as {e:.2g} m")
@@ -555,7 +566,8 @@ def curve_of_trajectory(
 
 def _add_to_header(header: dict[str, str], frame: Frame) -> None:
     """Add what a frame says of the gas; raise ValueError if the header contradicts it."""
-    (N, d), equal = frame.position.shape, frame.equal
+    N, d = frame.position.shape
+    equal = frame.equal
     from_file: dict[str, float] = {"N": N, "dimension": d}
     if "diameter" in equal or "radius" in equal:
         sigma = float(equal["diameter"][0] if "diameter" in equal else 2 * equal["radius"][0])

@@ -31,7 +31,7 @@ MORE_GRAINS = 4
 """Factor of N."""
 
 DENSITY_RATIO = 3.0
-"""Packing fraction of a second experiment over that of the first, or its inverse."""
+"""Ratio of the packing fractions of two experiments, the larger over the smaller."""
 
 MAX_PACKING = 0.2
 """Largest packing fraction of a second experiment."""

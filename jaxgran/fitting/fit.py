@@ -67,7 +67,7 @@ def fit(
     A model without noise is fitted by Newton's method. A stochastic model is fitted to T and T_rot
     by Gauss-Newton steps, each on one simulation, that start at the fit of kinetic theory (or at
     `start`). The errors then include the noise of the simulations, estimated from their replicas,
-    and the range is that of kinetic theory about the fitted curve. A bias of the derivatives by
+    and the range comes from kinetic theory about the fitted curve. A bias of the derivatives by
     some per cent slows the search and scales the standard error by the same factor, but does not
     shift the estimate, at which the residuals vanish.
 
@@ -211,7 +211,7 @@ def _by_label(measurement: Any) -> dict[str, Measurement]:
 
 
 def _check_no_copies(measurements: dict[str, Measurement]) -> None:
-    """Raise ValueError if all values of one measurement are among those of another one."""
+    """Raise ValueError if another measurement has all values of one of them."""
     rows = {label: _rows_of(m.data) for label, m in measurements.items()}
     for a, b in permutations(rows, 2):
         if rows[a] <= rows[b]:
@@ -245,7 +245,7 @@ def _kind(value: Any) -> str:
 
 
 def _names(names: Any, gas: Gas) -> tuple[str, ...]:
-    """Return names of parameters: symbols of files become names, and `LAW` those of the law."""
+    """Return names of parameters: `LAW` and symbols of files are replaced by them."""
     names = () if names is None else names
     names = (names,) if isinstance(names, str) else names
     if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names):
@@ -258,7 +258,7 @@ def _names(names: Any, gas: Gas) -> tuple[str, ...]:
 
 
 def _priors_by_label(measurements: dict[str, Measurement]) -> dict[str, Priors]:
-    """Return the priors of shared parameters (`SHARED`) and of those of each measurement.
+    """Return the priors of shared parameters (`SHARED`) and of each measurement.
 
     Several measurements share the parameters of the material.
     """

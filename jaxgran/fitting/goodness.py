@@ -25,7 +25,8 @@ def goodness(problem: Problem, found: Evaluation) -> dict[str, Any]:
     size = found.gradient.size
     degrees = max(sum(counts.values()) - size, 1)
     measured = [row for row in found.rows if not row.is_prior]
-    upper, lower = [], []
+    upper = []
+    lower = []
     for row in measured:
         own = problem.num_free if len(measured) == 1 else 0
         number = max(counts[id(row)] - own, 1)

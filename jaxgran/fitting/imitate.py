@@ -133,7 +133,8 @@ def imitate(
         result: a fit of one curve, with N.
         runs: number of imitations of each truth, >= 2.
         model: particle model of N particles; by default DSMC, or hard spheres between walls, in
-            boxes above L_c and in dense gases. Its number of replicas is set to that of all runs.
+            boxes above L_c and in dense gases. Its number of replicas is set to the number of all
+            runs.
         key: key of the random numbers, by default `jax.random.key(0)`.
         progress: show a progress bar on a terminal.
 

@@ -32,7 +32,9 @@ UNBOUNDED = 1e3
 MIN_PARTICLES = 50
 """Particles of a model from which on the noise of its curves is known."""
 
-DETERMINED, NOT_DETERMINED, NOT_CONSISTENT = "determined", "not determined", "not consistent"
+DETERMINED = "determined"
+NOT_DETERMINED = "not determined"
+NOT_CONSISTENT = "not consistent"
 """Grades of `Fit.grade`."""
 
 MESSAGES = {
@@ -68,29 +70,29 @@ MESSAGES = {
     "chi2": "reduced chi^2 is {reduced:.3g} for {degrees} degrees of freedom (probability by "
     "chance: {chance} %)",
     "too rough": "the curve scatters more than N equal spheres can: a mixture of sizes, eps that "
-    "scatters, fewer grains than told, or noise of the measurement",
+    "scatters, fewer grains than given, or noise of the measurement",
     "as few": " (some {number:.2g} grains would scatter as much)",
     "too smooth": "the curve scatters less than N equal spheres do: grains that walls cool, more "
-    "grains than told, or a curve that was smoothed",
+    "grains than given, or a curve that was smoothed",
     "rising": "T rises from {first:.3g} to {last:.3g} m^2/s^2, and nothing drives this gas: "
     "scatter does not explain it",
     "gravity": "gravity is taken as absent: .01 g in a box with dissipating walls (restitution .8) "
     "made A 9 % too small",
     "errors too large": "the residuals are smaller than the errors of T allow by chance: these "
     "errors are too large, or they are common to the points",
-    "scatter": "the scatter is that of {number:.3g} +- {error:.2g} grains",
+    "scatter": "the curve scatters as {number:.3g} +- {error:.2g} grains do",
     "of each": "{label}: chi^2 is {chi2:.3g} for {number} points; its weight in {symbol} is "
     "{weight:.2f}",
     "assumptions": "the model assumes {spheres}, {where}",
     "absent": "known to be absent: {names}",
     "quick": "alternatives were not compared, as requested",
     "driven": "additional loss terms were not tested: the gas is driven",
-    "of particles": "the range over alternatives is that of kinetic theory, shifted to the fitted "
+    "of particles": "the range over alternatives comes from kinetic theory, shifted to the fitted "
     "curve",
     "is preferred": "{name} added to the model decreases -2 ln L by {improvement:.3g}, which "
     "happens by chance in less than 1 % of fits: then {range}",
-    "outside": "the estimate {estimate:.3g} lies outside of this range, because it is that without "
-    "the preferred alternative",
+    "outside": "the estimate {estimate:.3g} lies outside of this range, because it assumes that "
+    "the preferred alternative is absent",
     "is possible": "{name} cannot be excluded: then {range}; to exclude it, the errors must be "
     "{factor:.2g} times smaller",
     "outliers": "far outliers at {places}: check them and their error bars",
@@ -338,12 +340,14 @@ def _alternatives(result: Fit, absent: tuple[str, ...], quick: bool) -> Iterator
         yield say("of particles")
     estimate = float(result.estimate[0])
     for alternative in result.alternatives:
-        low, high = float(alternative.low[0]), float(alternative.high[0])
+        low = float(alternative.low[0])
+        high = float(alternative.high[0])
         span = _range(result, low, high)
         if alternative.restitution is not None:
             span = say("no meaning", eps=alternative.restitution)
         if alternative.preferred:
-            name, improvement = alternative.name, alternative.improvement
+            name = alternative.name
+            improvement = alternative.improvement
             yield say("is preferred", name=name, improvement=improvement, range=span)
             if not low <= estimate <= high:
                 yield say("outside", estimate=estimate)
@@ -358,7 +362,7 @@ def _assumptions(result: Fit) -> str:
     spheres = " spheres of constant friction" if "friction" in elements else spheres
     spheres = f"equal{spheres}"
     if "diameter_sd" in elements:
-        spheres = "smooth spheres of one material, whose sizes differ as told"
+        spheres = "smooth spheres of one material, whose sizes differ as given"
     where = [] if "container" in elements else ["far from walls"]
     where += [] if "drag" in elements else ["in vacuum"]
     where.append("at homogeneous density")

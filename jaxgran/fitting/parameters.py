@@ -47,7 +47,7 @@ def domain_of(gas: Gas, name: str) -> Domain:
 
 
 def with_names_of_law(names: Any, gas: Gas) -> Any:
-    """Return names of free parameters with those of all parameters of the law in place of `LAW`."""
+    """Return names of free parameters, with all parameters of the law in place of `LAW`."""
     names = (names,) if isinstance(names, str) else names
     if not isinstance(names, tuple | list) or LAW not in names:
         return names
@@ -102,7 +102,7 @@ class Unknown(NamedTuple):
 
     @property
     def title(self) -> str:
-        """Name in a `Fit`: that of a parameter of one measurement begins with its label."""
+        """Name in a `Fit`, which begins with a label for a parameter of one measurement."""
         return self.name if not self.label else f"{self.label}: {self.name}"
 
 
@@ -122,7 +122,8 @@ def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
     """
     times, T = _above_noise(curve)
     power, line = _power_and_line(gas, curve)
-    scale, origin = T[0], (np.asarray(gas.temperature) / T[0]) ** -power
+    scale = T[0]
+    origin = (np.asarray(gas.temperature) / T[0]) ** -power
     values: dict[str, Any] = {}
     if "temperature" in free:
         origin, slope = _intercept_and_slope(times, line)
@@ -334,14 +335,17 @@ def prior_residuals(
             row = residuals_and_slopes(_law_prior, gas, floats)
             rows[name] = jax.tree.map(np.asarray, row)
             continue
-        domain, given, error = prior_domain(gas, name), np.asarray(given), np.asarray(error)
+        domain = prior_domain(gas, name)
+        given = np.asarray(given)
+        error = np.asarray(error)
         width = error / domain.slope(given)
 
         def value_of(name: str) -> np.ndarray:
             return np.asarray(values[name] if name in values else gas.value(name))
 
         if name == DENSITY:
-            mass, diameter = value_of("mass"), value_of("diameter")
+            mass = value_of("mass")
+            diameter = value_of("diameter")
             value = 6 / np.pi * mass / diameter**3
             slopes = {"mass": 1 / (mass * width), "diameter": -3 / (diameter * width)}
         else:

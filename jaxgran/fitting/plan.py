@@ -75,7 +75,7 @@ class Plan:
 
     Attributes:
         parameter: name of the first free parameter.
-        truth: its value, SI: that of the fit of the given values.
+        truth: its value, SI, fitted to the given values.
         present: the range to expect of the experiment as it is.
         additions: those with an addition, the largest gain first: the best three, of different
             kinds, and then the others, which were compared for the given values alone.
@@ -266,7 +266,7 @@ class _Row:
 
 
 def _compared(candidates: Sequence[Candidate], base: Measurement, present: _Row) -> list[_Row]:
-    """Return those of some additions that apply, for the given values, the best one first."""
+    """Return the additions that apply, for the given values, the best one first."""
     rows = []
     for candidate in candidates:
         changed = candidate.change(base)

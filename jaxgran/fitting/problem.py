@@ -64,7 +64,7 @@ class Problem:
         unknowns: the free parameters, then those that vary because of a prior, then nuisance
             parameters.
         num_free: number of elements of the free parameters.
-        priors: of shared parameters (`SHARED`) and of those of one measurement, by its label.
+        priors: of shared parameters (`SHARED`) and of single measurements, by label.
         fixed: SI values of further parameters, by label and name.
         tolerance: factor of the model's tolerance.
     """

@@ -137,7 +137,9 @@ def _parameters(rows: list[dict[str, Any]]) -> Iterator[str]:
     """Yield the table of the ranges and the estimates."""
     cells = []
     for row in rows:
-        low, high, estimate = row["low"], row["high"], row["estimate"]
+        low = row["low"]
+        high = row["high"]
+        estimate = row["estimate"]
         value = f"{estimate:.5g} +- {row['std_err']:.2g}"
         value += " (rejected)" if estimate < low or estimate > high else ""
         difference = f"{row['header']:.5g}" if row["header"] else ""

@@ -55,7 +55,7 @@ class Fit:
             exclude; {} where the alternatives were not compared.
         alternatives: other explanations of the data, those that fit best first.
         chi2: sum of squares of all independent residuals of unit variance.
-        degrees_of_freedom: number of residuals minus that of the parameters.
+        degrees_of_freedom: number of residuals minus number of parameters.
         p_value: probability of residuals as large by chance, of the quantity that fits worst.
         smooth_p_value: probability of residuals as small by chance.
         log_likelihood: largest value of ln L, up to a constant.
@@ -132,7 +132,7 @@ class Fit:
     def standard_error(self) -> Float[np.ndarray, "p"]:
         """One standard deviation of each estimate, SI, from all known sources of error.
 
-        It holds if the scene contains nothing that the fit was not told of: see `ranges`.
+        It assumes that the scene has no effect that is missing in the measurement: see `ranges`.
         """
         return np.sqrt(np.diag(self.covariance))
 

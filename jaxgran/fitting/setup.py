@@ -34,7 +34,7 @@ class Request:
         model: the model.
         names: of the shared free parameters.
         separate: of those that each curve has separately.
-        priors: of shared parameters and of those of each measurement.
+        priors: of shared parameters and of each measurement.
         start: a further guess; None without one.
         absent: effects that are known to be absent in all curves.
         quick: whether alternatives are left out.

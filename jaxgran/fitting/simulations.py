@@ -426,12 +426,14 @@ def _result(
     columns = np.concatenate([np.mean(differences, axis=0)[:, None], slopes], axis=1)
     curve = average.curve
     whitened = curve.whiten(columns)
-    residuals, sensitivity = whitened[:, 0], whitened[:, 1:]
+    residuals = whitened[:, 0]
+    sensitivity = whitened[:, 1:]
     number = int(np.sum(sims.rows.used))
     ratio = 1.0
     if sims.rows.measurement.num_particles is None:  # the scatter tells how many grains there were
         ratio = max(float(residuals @ residuals) / max(number - p, 1), 1e-12)
-        residuals, sensitivity = residuals / ratio**0.5, sensitivity / ratio**0.5
+        residuals = residuals / ratio**0.5
+        sensitivity = sensitivity / ratio**0.5
     prior_rows = _smoothness_rows(problem, flat)
     information = sensitivity.T @ sensitivity + prior_rows.T @ prior_rows
     covariance = np.linalg.pinv(information, rcond=problem.model.derivative_accuracy**2)
@@ -562,7 +564,7 @@ def _explanations(
 def derivative_bias(sims: Simulations, search: Search, gas: Gas, sensitivity: np.ndarray) -> float:
     """Return the relative bias of the derivatives of particles, as a weighted mean over the points.
 
-    It is that of the curve of the last run or, if this has none, an estimate by the model.
+    It comes from the curve of the last run or, if this has none, from an estimate by the model.
     """
     curve = search.curve
     bias = curve.derivative_bias

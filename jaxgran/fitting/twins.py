@@ -151,7 +151,7 @@ def _with_effect(alternative: Alternative, amplitude: float, gas: Gas, rate: flo
 def twin(measurement: Measurement, truth: Truth = AS_GIVEN) -> Measurement:
     """Return a measurement with the values of kinetic theory for a truth, without noise.
 
-    The relative errors are those of the given values.
+    The relative errors are taken from the given values.
 
     Args:
         measurement: of a curve or a drop test.

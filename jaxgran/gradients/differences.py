@@ -96,7 +96,7 @@ def by_differences(
 
 
 def _difference(name: str, base: Array, upper: Array, lower: Array) -> Array:
-    """Difference of a record between two ends; that of T in the variable g."""
+    """Difference of a record between two ends; for T in the variable g."""
     plain = upper - lower
     if name != "temperature":
         return plain

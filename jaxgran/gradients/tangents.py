@@ -225,7 +225,7 @@ class ExchangeTangents(NamedTuple):
     def initial(
         cls, directions: Any, material: Any, velocity: Float[Array, "n d"], replicas: int
     ) -> "ExchangeTangents":
-        """Return the tangents at t = 0, where T is 1 and T_rot is that of the material."""
+        """Return the tangents at t = 0, where T is 1 and the material gives T_rot."""
         directions = jax.tree.map(
             lambda x: jnp.concatenate([x, jnp.zeros_like(x, shape=(1, *x.shape[1:]))]), directions
         )

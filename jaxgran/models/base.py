@@ -92,7 +92,7 @@ class AbstractModel(eqx.Module):
         self.check(gas)
 
     def solve(self, gas: Gas, times: Float[Array, "times"], tolerance: Any) -> CoolingCurve:
-        """Return the curve inside the compiled program of a fit: by default that of `simulate`.
+        """Return the curve inside the compiled program of a fit, by default by `simulate`.
 
         A model that solves equations multiplies its tolerance by `tolerance`.
         """
@@ -134,8 +134,8 @@ class AbstractModel(eqx.Module):
     def sized_for(self, gas: Gas, spare: float = 2.0) -> "AbstractModel":
         """Return this model with fixed sizes of its arrays, for `jax.jit`.
 
-        That is the model itself, unless its arrays grow with the need, as those of
-        `jaxgran.HardSpheres` and `jaxgran.SoftSpheres` do.
+        That is the model itself, unless its arrays grow with the need, as in
+        `jaxgran.HardSpheres` and `jaxgran.SoftSpheres`.
         """
         return self
 

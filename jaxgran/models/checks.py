@@ -154,8 +154,8 @@ def check_volume(gas: Gas, num_particles: int) -> None:
         if num_particles / share >= 2:
             ways.append(f"use {num_particles / share:.0f} particles")
         raise ValueError(
-            f"{num_particles} spheres of packing_fraction {phi:.4g} need a container {share:.4g} "
-            f"times as large as that of side {np.asarray(walls.side)} m: {', or '.join(ways)}."
+            f"{num_particles} spheres of packing_fraction {phi:.4g} need {share:.4g} times the "
+            f"volume of the container with side {np.asarray(walls.side)} m: {', or '.join(ways)}."
         )
 
 
@@ -229,7 +229,7 @@ def limitations_of_homogeneity(gas: Gas, num_particles: int | None) -> tuple[Lim
     if phi > CRYSTAL[gas.dimension]:
         words = (
             f"packing_fraction {phi:.3g} is above {CRYSTAL[gas.dimension]:g}, where spheres form a "
-            "crystal or a glass, and the contact value is that of a fluid"
+            "crystal or a glass, and the contact value holds for a fluid"
         )
         limitations.append(Limitation(words, True, POSITIONS_NEEDED))
     return tuple(limitations)

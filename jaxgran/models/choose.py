@@ -134,7 +134,7 @@ def choose_model(
         num_particles: N of the gas, if known: gives the box, and the number of particles of a
             particle model (4000 if unknown). Without it the gas is assumed to stay homogeneous.
         replicas: number of replicas of a particle model.
-        models: the models to choose from, cheapest first; by default those of this package.
+        models: the models to choose from, cheapest first; by default all models of this package.
 
     Returns:
         `Choice`: the model, reasons in words, all candidates with their estimated errors. If no
@@ -239,7 +239,8 @@ def error_model_of_curve(
     for name in ("contact_fraction", "overlap", "softness"):
         values[name] = getattr(scales, name)
     values = {name: np.asarray(value, float) for name, value in values.items()}
-    flow = scatter = np.zeros_like(values["time"])
+    flow = np.zeros_like(values["time"])
+    scatter = flow
     if num_particles is not None:
         critical = np.asarray(scales.critical_box, float)
         flow, scatter = flow_share(gas, values["log_temperature"], critical, num_particles)

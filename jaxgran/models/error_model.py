@@ -82,10 +82,12 @@ the first sound times, until T has fallen to .7, it is longer by 8 % for eps_w =
 .8.
 """
 
-ELASTIC_WALL_ERROR, LOSS_WALL_ERROR, NARROW_BOX = 0.004, 0.08, 30.0
-"""a, b, c of the error of a given box, by the same measurements:
-``min(a + b (1 - eps_w), WALL_ERROR) (T/T_0)^(1/2) + c (sigma/W)^4`` with the width W that centres
-have."""
+ELASTIC_WALL_ERROR = 0.004
+LOSS_WALL_ERROR = 0.08
+NARROW_BOX = 30.0
+"""Error of a given box, by the same measurements: ``e (T/T_0)^(1/2) + NARROW_BOX (sigma/W)^4``,
+``e = min(ELASTIC_WALL_ERROR + LOSS_WALL_ERROR (1 - eps_w), WALL_ERROR)``, with the width W that
+centres have."""
 
 ROUGH_WALL_ERROR = 0.05
 """The same for rough walls, beta_t from -.3 to .5.
@@ -194,7 +196,9 @@ class ErrorModel(NamedTuple):
         return float(np.max(np.abs(np.gradient(self.log_temperature, t)) * delay))
 
     def _error_where_driven(self, e: Float[np.ndarray, "times"]) -> float:
-        t, y, worst = self.time, 0.0, 0.0
+        t = self.time
+        y = 0.0
+        worst = 0.0
         temperature = float(self.gas.temperature) * np.exp(self.log_temperature)
         heating = float(self.gas.value("drive_strength")) / temperature
         loss = np.maximum(heating - np.gradient(self.log_temperature, t), 0.0)
@@ -217,7 +221,8 @@ class ErrorModel(NamedTuple):
         The projection remembers T alone, and not how the flow depends on the material. The error
         is 0 in boxes below L_c.
         """
-        gas, n = self.gas, self.num_particles
+        gas = self.gas
+        n = self.num_particles
         if n is None:
             return np.zeros(self.time.shape)
         scales = scales_at(gas)
@@ -238,7 +243,8 @@ class ErrorModel(NamedTuple):
     @property
     def mixing(self) -> Float[np.ndarray, "times"] | float:
         """Error of the cooling rate of models that assume a mixed gas between walls."""
-        gas, walls = self.gas, self.gas.container
+        gas = self.gas
+        walls = self.gas.container
         if walls is None:
             return 0.0
         if walls.tangential_restitution is not None:
@@ -371,7 +377,9 @@ def flow_share(
     counted = q[0] < MAX_WAVENUMBER_SQUARED
     s = -log_temperature
     # Energy of one mode in units of T, minus its value of 1 in equilibrium.
-    energy, flow, variance = np.zeros(count.size), [0.0], [0.0]
+    energy = np.zeros(count.size)
+    flow = [0.0]
+    variance = [0.0]
     for ds, q_now in zip(np.diff(s), (q[1:] + q[:-1]) / 2, strict=True):
         growth = 1 - q_now
         growth = np.where(np.abs(growth) < 1e-6, 1e-6, growth)

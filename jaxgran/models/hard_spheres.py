@@ -69,10 +69,10 @@ class HardSpheres(AbstractSpheres):
             corner, and centres must be at least a radius from each wall.
         neighbours: the search for pairs: "sweep" (for boxes of up to some thousand spheres),
             "cells" (for larger ones), "jax-md" (not inside `jax.jit`), or "auto" for the fastest.
-        differences: step in the logarithm of an impact's loss, in (0, 0.5], of derivatives by
-            differences of whole runs (`jaxgran.gradients.differences`), 0.3 for most uses. They
-            need two more runs for each number of the law and have noise, but no bias in a gas that
-            clusters. None for projected derivatives.
+        differences: step in ln(loss of an impact), in (0, 0.5], typically 0.3: derivatives are then
+            differences of whole runs (`jaxgran.gradients.differences`). They need two more runs for
+            each number of the law and have noise, but no bias in a gas that clusters. None for
+            projected derivatives.
 
     Derivatives of T, T_rot and collisions are known in every parameter of the gas and in the times,
     forward and reverse, for any law; of smooth spheres also those of the dissipated energy. The gas

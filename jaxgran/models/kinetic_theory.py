@@ -39,7 +39,7 @@ TOLERANCES = validation.Domain(0.0, 0.1)
 """Relative tolerances of the solver."""
 
 SONINES = validation.Domain(-0.4, 1.0)
-"""Values of a_2 at t = 0; that of spheres of one speed is -0.4, of disks -0.5."""
+"""Values of a_2 at t = 0; spheres of one speed have -0.4, disks -0.5."""
 
 NUM_GRID_TIMES = 97
 """Number of times between which a covariance is propagated, in addition to the given ones."""
@@ -97,7 +97,7 @@ class KineticTheory(AbstractModel):
     <dr^2>.
 
     Spheres of unequal sizes (`Gas.diameter_sd`) are two halves of small and large spheres with a
-    temperature each (`jaxgran.theory.sizes`). They may have drag, which is that of Stokes;
+    temperature each (`jaxgran.theory.sizes`). They may have Stokes' drag;
     roughness, walls and a drive are refused, and the curve has no D and <dr^2>. The rate of runs of
     1 : 1.2 and 1 : 1.4 and of diameters within 10 % is right within .6 %
     (``experiments/accuracy/size_statistics.py``).
@@ -115,7 +115,7 @@ class KineticTheory(AbstractModel):
             ``KineticTheory.all_corrections - {"correlations"}``.
         order: 3 solves for a_2 and a_3, with D in the second Sonine order; 2 for a_2, with D in the
             first.
-        initial_sonine: a_2 at t = 0, in (-0.4, 1); that of `jaxgran.steady_state` for a gas that
+        initial_sonine: a_2 at t = 0, in (-0.4, 1); `jaxgran.steady_state` gives it for a gas that
             white noise has driven.
         rtol: relative tolerance of the adaptive solver; by default 1e-8 in float64, 1e-5 in
             float32. The relative error of T is about rtol, the error of <dr^2> about rtol in mean
@@ -238,7 +238,7 @@ class KineticTheory(AbstractModel):
         homogeneous, at low density: `jaxgran.models.error_model` has the factors of others.
 
         Args:
-            gas: the scene; its T_0 is that of the run itself.
+            gas: the scene; its T_0 is the first temperature of the run itself.
             times: t, s, shape (times,), >= 0, increasing.
             num_particles: N, >= 1.
             rotation: give also ln T_rot of rough spheres.
@@ -257,7 +257,8 @@ class KineticTheory(AbstractModel):
         >>> [round(float(error), 4) for error in jnp.sqrt(jnp.diag(covariance))]
         [0.0089, 0.0151, 0.0237, 0.0262]
         """
-        gas, times = checks.checked_gas(gas), validation.checked_times(times)
+        gas = checks.checked_gas(gas)
+        times = validation.checked_times(times)
         num_particles = validation.checked_int("num_particles", num_particles, 1)
         self.check_scene(gas)
         if rotation and gas.surface is None:
@@ -448,7 +449,8 @@ class KineticTheory(AbstractModel):
     def _is_sound(self, gas: Gas) -> Bool[Array, ""]:
         sound = jnp.asarray(True)
         if "softness" in self.corrections:
-            law, hottest = gas.reduced_law, jnp.ones_like(gas.temperature)
+            law = gas.reduced_law
+            hottest = jnp.ones_like(gas.temperature)
             sound = softness_factor(law, hottest, gas.dimension) > 0
         if gas.diameter_sd is None:
             return sound

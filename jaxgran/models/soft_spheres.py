@@ -78,7 +78,7 @@ class SoftSpheres(AbstractSpheres):
     A gas may have walls (of a `jaxgran.Viscoelastic` law: the same force, with the mass and radius
     of one sphere), where momentum is not conserved; drag, exact in the drift; and friction, also of
     walls (`jaxgran.Frictional`). The energy that they take counts as dissipated. In a step the
-    normal kicks of pairs come first, then those of walls, then those of tangential forces.
+    normal kicks of pairs come first, then normal kicks of walls, then tangential kicks.
 
     Args:
         num_particles: N in each box, >= 2; the box must be 2.1 diameters or longer. It lives on
@@ -93,10 +93,10 @@ class SoftSpheres(AbstractSpheres):
         projection: mean free times between thermal projections of a derivative, > 0; derivatives
             agree for 0.02 to 0.5 (see `jaxgran.gradients.tangents`). None for the plain
             derivative, which is exact, and useless after 3 to 5 collisions per particle.
-        differences: step in the logarithm of an impact's loss, in (0, 0.5], of derivatives by
-            differences of whole runs (`jaxgran.gradients.differences`), 0.3 for most uses. They
-            need two more runs for each of A and alpha and have noise, but no bias in a gas that
-            clusters. None for projected derivatives.
+        differences: step in ln(loss of an impact), in (0, 0.5], typically 0.3: derivatives are then
+            differences of whole runs (`jaxgran.gradients.differences`). They need two more runs for
+            each of A and alpha and have noise, but no bias in a gas that clusters. None for
+            projected derivatives.
 
     Derivatives of T, T_rot, collisions and the energies are known, forward and reverse: a gas
     depends on (alpha, A), its walls and drag, its collision frequency and the times only. The

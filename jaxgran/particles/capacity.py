@@ -19,7 +19,7 @@ from jaxgran.particles.neighbours import compiled_engine, unsorted_share
 from jaxgran.scene.geometry import contact_value, sphere_surface
 
 MAX_SHARED_ROWS = 128
-"""Number of unused rows up to which their run time is less than that of another compilation."""
+"""Number of unused rows up to which they cost less time than another compilation."""
 
 SMALL_RUN = 500
 """Number of particles of all replicas below which a run takes less time than a compilation."""

@@ -41,7 +41,7 @@ COINCIDENT = 1e-9
 """Distance, in diameters, that is assumed between points at the same place."""
 
 SAME_BOX = 1e-6
-"""Relative difference up to which the box of a start counts as that of the gas."""
+"""Relative difference up to which a start is taken to have the box of the gas."""
 
 
 def maxwellian_velocities(
@@ -239,7 +239,7 @@ def check_start(start: Particles | None, gas: Gas, replicas: int, num_particles:
             for s in (start.box_side, side)
         )
         raise ValueError(
-            f"start.box_side is {given} diameters, that of the gas {expected}. Change "
+            f"start.box_side is {given} diameters, but the box of the gas has {expected}. Change "
             "packing_fraction or the start"
         )
 

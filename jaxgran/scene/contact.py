@@ -37,7 +37,9 @@ def elastic_constant(
     >>> f"{float(jaxgran.elastic_constant(5e7, 0.22, 2e-3)):.3g}"
     '7.83e+05'
     """
-    y, nu, sigma = jnp.asarray(youngs_modulus), jnp.asarray(poisson_ratio), jnp.asarray(diameter)
+    y = jnp.asarray(youngs_modulus)
+    nu = jnp.asarray(poisson_ratio)
+    sigma = jnp.asarray(diameter)
     return 2 * y * jnp.sqrt(sigma / 4) / (3 * (1 - nu**2))
 
 
@@ -215,7 +217,8 @@ def impact(
     """
     NON_NEGATIVE.check("beta", beta, "It is 1.5 A alpha^0.4 v^0.2.")
     beta = jnp.asarray(beta, dtype=jnp.result_type(float))
-    zero, one = jnp.zeros_like(beta), jnp.ones_like(beta)
+    zero = jnp.zeros_like(beta)
+    one = jnp.ones_like(beta)
 
     # Order of magnitude of the rebound speed; the absolute tolerance must be much smaller.
     smallest = (1 + jax.lax.stop_gradient(beta)) ** (-5 / 3 if clipped else -5)

@@ -195,7 +195,8 @@ class Walls(Element):
 
     def __check_init__(self):
         if (self.tangential_damping is None) != (self.friction is None):
-            given, missing = "tangential_damping", "friction"
+            given = "tangential_damping"
+            missing = "friction"
             if self.tangential_damping is None:
                 given, missing = missing, given
             raise ValueError(
@@ -286,7 +287,9 @@ def check_elements(gas: Any) -> None:
                 "rotational_rate of the drag needs spheres that rotate, got a rate of "
                 f"{np.asarray(rate)} 1/s. Add surface=jaxgran.Rough(...), or leave it out."
             )
-    walls, surface, dimension = gas.container, gas.surface, gas.dimension
+    walls = gas.container
+    surface = gas.surface
+    dimension = gas.dimension
     if walls is None:
         return
     if np.ndim(walls.side) > 0 and np.shape(walls.side) != (dimension,):
@@ -313,7 +316,7 @@ VOLUME_TOLERANCE = 0.02
 
 
 def container_volume_ratio(gas: Any, num_particles: int | float) -> float:
-    """Ratio of the volume of N spheres at the gas's number density to that of its container."""
+    """Ratio of two volumes: of N spheres at the gas's number density, and of its container."""
     sides = np.broadcast_to(gas.container.side, (gas.dimension,))
     return float(num_particles / gas.number_density) / float(np.prod(sides))
 

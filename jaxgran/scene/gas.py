@@ -65,7 +65,7 @@ _PACKING_DOMAINS = {d: Domain(0.0, close) for d, close in CLOSE_PACKING.items()}
 def _checked_law(law: laws.RestitutionLaw) -> laws.RestitutionLaw:
     if not isinstance(law, laws.RestitutionLaw):
         raise ValueError(f"law must be a restitution law such as jaxgran.Viscoelastic, got {law!r}")
-    # Functions in a law, as those of a neural network, must not be leaves beside its arrays.
+    # Functions in a law, as in a neural network, must not be leaves beside its arrays.
     law = jax.tree.map(_without_function_leaf, law)
     laws.check_reduced_units(law)
     return law
@@ -118,7 +118,7 @@ def optional_element(name: str) -> Any:
 
 
 MAX_SIZE_SPREAD = 0.2
-"""Largest standard deviation of diameters over their mean: that of two sizes 1 : 1.5."""
+"""Largest standard deviation of diameters over their mean: two sizes 1 : 1.5 have it."""
 
 
 def _optional_number(name: str) -> Any:
@@ -518,7 +518,8 @@ def scaled_critical_wavenumber(
     packing_fraction: Float[Array, ""], dimension: int
 ) -> Float[Array, ""]:
     """Critical wavenumber ``k_c sigma/sqrt(I)``, with I = <1 - eps^2>; see `Gas.critical_box`."""
-    g_2, phi = contact_value(packing_fraction, dimension), packing_fraction
+    g_2 = contact_value(packing_fraction, dimension)
+    phi = packing_fraction
     b, first, second = SHEAR_VISCOSITY[dimension]
     y = b * phi * g_2
     dense = g_2**2 / (1 + first * y + second * y**2)
@@ -611,7 +612,7 @@ class ReducedSizes(NamedTuple):
 
     @property
     def masses(self) -> Float[Array, "2"]:
-        """Masses of small and large spheres, over that of a sphere of the mean diameter."""
+        """Masses of small and large spheres, over the mass of a sphere of the mean diameter."""
         return jnp.stack([1 - self.spread, 1 + self.spread]) ** 3
 
 
@@ -648,10 +649,12 @@ def reduced_scene(gas: Gas) -> ReducedScene:
     """Return a gas of impacts with rates in the unit of time `path_length` over `impact_speed`.
 
     The density of centres at a hard wall is Z times the mean density (contact theorem). Here
-    ``Z = 1 + 2^(d-1) phi g_2`` is the pressure of elastic spheres over that of a dilute gas. Hence
-    a sphere hits the walls ``Z sum_k 2/(L_k - sigma) sqrt(T/(2 pi))`` times a second.
+    ``Z = 1 + 2^(d-1) phi g_2`` is the pressure of elastic spheres over the pressure of a dilute
+    gas. Hence a sphere hits the walls ``Z sum_k 2/(L_k - sigma) sqrt(T/(2 pi))`` times a second.
     """
-    d, length, speed = gas.dimension, gas.path_length, gas.impact_speed
+    d = gas.dimension
+    length = gas.path_length
+    speed = gas.impact_speed
     surface = walls = drag = drive = None
     if isinstance(gas.surface, elements.Rough):
         rough = gas.surface
@@ -681,7 +684,8 @@ def _reduced_sizes(gas: Gas, spread: Float[Array, ""]) -> ReducedSizes:
     d = gas.dimension
     diameters = jnp.stack([1 - spread, 1 + spread])
     a, b = diameters[jnp.array(PAIRS).T]
-    radius, mass = 2 * a * b / (a + b), 2 * (a * b) ** 3 / (a**3 + b**3)
+    radius = 2 * a * b / (a + b)
+    mass = 2 * (a * b) ** 3 / (a**3 + b**3)
 
     def law(radius: Array, mass: Array) -> laws.ReducedLaw:
         return gas.law.reduced(
@@ -718,7 +722,7 @@ class ReducedContact(eqx.Module):
 
 
 class ReducedFriction(NamedTuple):
-    """Friction of contacts: `Frictional` in units of `sphere_scene`, or that of walls.
+    """Friction of contacts: `Frictional` in units of `sphere_scene`, or the friction of walls.
 
     Attributes:
         damping: x_t.
@@ -787,7 +791,9 @@ class SphereScene(NamedTuple):
 
 def sphere_scene(gas: Gas, num_particles: int, material: ReducedScene) -> SphereScene:
     """Return N spheres in a box, with the law, the surface and the walls of a material."""
-    side, container, nu = gas.box_side(num_particles) / gas.diameter, None, gas.collision_frequency
+    side = gas.box_side(num_particles) / gas.diameter
+    container = None
+    nu = gas.collision_frequency
     if gas.container is not None:
         container = jnp.broadcast_to(gas.container.side, (gas.dimension,)) / gas.diameter
         side = jnp.max(container) + 1

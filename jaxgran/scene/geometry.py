@@ -95,7 +95,8 @@ def pair_contact_value(
             two diameters, any shape.
         dimension: d, 2 or 3.
     """
-    phi, square = jnp.asarray(packing_fraction), jnp.asarray(spread) ** 2
+    phi = jnp.asarray(packing_fraction)
+    square = jnp.asarray(spread) ** 2
     rest = 1 - phi
     if dimension == 3:
         y = pair * (1 + square) / (1 + 3 * square)
@@ -109,7 +110,7 @@ def contact_value_slopes(
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Logarithmic slopes of the pair correlation of hard spheres at contact.
 
-    The arguments are those of `contact_value`.
+    Arguments: see `contact_value`.
 
     Returns:
         Slope ``d ln g_2/d ln sigma = d phi g_2'/g_2`` at fixed number density.

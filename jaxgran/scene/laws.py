@@ -81,7 +81,8 @@ class RestitutionLaw(eqx.Module):
                 setattr(cls, name, eqx.field(converter=number_named(name), default=default))
 
     def __check_init__(self):
-        kind, base = type(self), RestitutionLaw
+        kind = type(self)
+        base = RestitutionLaw
         if kind.reduced is base.reduced and kind.restitution is base.restitution:
             raise ValueError(
                 f"{kind.__name__} has no restitution: define restitution(self, "
@@ -188,7 +189,7 @@ class ReducedLaw(eqx.Module):
     def impact_length(self, normal_speed: Float[Array, "..."]) -> Float[Array, "..."]:
         """Length scale of the overlap in diameters, ``X = (v^2/alpha)^(2/5)``.
 
-        It is zero for hard spheres, which is the default. The arguments are those of `restitution`.
+        It is zero for hard spheres, which is the default. Arguments: see `restitution`.
         """
         return jnp.zeros_like(normal_speed)
 
@@ -303,7 +304,7 @@ def _polynomial(coefficients: tuple[float, ...], x: Float[Array, "..."]) -> Floa
 def log_viscoelastic_restitution(beta: ArrayLike, *, clipped: bool = True) -> Float[Array, "..."]:
     """Natural logarithm of `viscoelastic_restitution`, accurate also for eps close to 1.
 
-    Arguments and validity are those of `viscoelastic_restitution`.
+    Arguments and validity: see `viscoelastic_restitution`.
     """
     beta = jnp.asarray(beta, dtype=jnp.result_type(float, beta))
     fit = _CLIPPED if clipped else _UNCLIPPED

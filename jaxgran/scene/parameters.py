@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 from jaxgran._utils import validation
 from jaxgran._utils.validation import ANY, FRACTION, NON_NEGATIVE, POSITIVE, Domain
 
-SCENE, MATERIAL = "scene", "material"
+SCENE = "scene"
+MATERIAL = "material"
 TANGENTIAL = Domain(-1.0, 1.0, low_allowed=True, high_allowed=True)
 INERTIA = Domain(0.0, 1.0, high_allowed=True)
 

@@ -36,7 +36,9 @@ NUM_RESTITUTIONS = 7
 """Number of values of eps that determine the polynomials of sixth degree in 1 - eps."""
 
 # Nodes that integrate polynomials of degree 18 in the velocities exactly.
-_NUM_NORMAL, _NUM_TANGENTIAL, _NUM_ANGLES = 10, 5, 6
+_NUM_NORMAL = 10
+_NUM_TANGENTIAL = 5
+_NUM_ANGLES = 6
 
 CLOSURE = {2: (0.1127, 0.2725, 4.1658, -2.8628), 3: (0.0667, 0.2452, 4.8105, -1.4002)}
 """p, q, r, s of ``a_4 = p a_2 + q a_3 + r a_2^2 + s a_2 a_3`` by dimension.
@@ -78,9 +80,10 @@ def _impact_nodes(dimension: int) -> tuple[Float[np.ndarray, "nodes"], ...]:
 
 
 def _term_coefficients(bilinear: np.ndarray, dimension: int, order: int) -> np.ndarray:
-    """Coefficients of `TERMS` from those of the products a_i a_j, with a_4 by its closure."""
+    """Coefficients of `TERMS` from coefficients of a_i a_j, with a_4 by its closure."""
     pairs = bilinear + np.swapaxes(bilinear, -1, -2)
-    one, square = pairs[..., 0, :], bilinear[..., 1, 1]
+    one = pairs[..., 0, :]
+    square = bilinear[..., 1, 1]
     if order == 2:
         return np.stack([bilinear[..., 0, 0], one[..., 1], square], axis=-1)
     fourth = one[..., 3, None] * np.asarray(CLOSURE[dimension])
@@ -140,7 +143,8 @@ def collision_changes(
             for s_k in label
         ]
         rows = np.stack(losses + relaxation)
-        first, second = sonine_polynomials(square_1), sonine_polynomials(square_2)
+        first = sonine_polynomials(square_1)
+        second = sonine_polynomials(square_2)
         return np.einsum("rn,in,jn->rij", rows, first * weights, second, optimize=True)
 
     epsilons = 1 - np.linspace(0, 2, NUM_RESTITUTIONS)
@@ -303,7 +307,9 @@ def slip_moments(m: Float[Array, "..."] | None, d: int) -> list[Float[Array, "..
             3 * c - c**3,
             2 * w * (4 - c - c**2),
         ]
-    x, g, h = c**2, jnp.ones(()), 2 / 3
+    x = c**2
+    g = jnp.ones(())
+    h = 2 / 3
     if m is not None:
         g = m * jnp.arctan2(1.0, m)
         series = jnp.polyval(jnp.asarray(_STEEP_SERIES, c.dtype), jnp.maximum(m, _STEEP) ** -2)
@@ -354,7 +360,8 @@ def rough_impact_means(
         The changes of v^2 by the tangential and by the normal part, the impulse times the slip over
         V, the changes of s^2, v^2 s^2 and s^4.
     """
-    N, r = NUM_SPIN_COMPONENTS[d], 1 / inertia
+    N = NUM_SPIN_COMPONENTS[d]
+    r = 1 / inertia
     uJ, JJ, uuJJ, uuuJ, J4, uJ3, gguJ, ggJJ = slip_moments(m, d)
     z = eta * r
     normal = kick * (kick * S - 2 * T)
@@ -422,14 +429,16 @@ def rough_energy_moments(
         <e> and <e'>; and the matrix <e^2>, <e e'>; <e e'>, <e'^2>.
     """
     uJ, JJ, uuJJ, _, J4, uJ3, gguJ, ggJJ = slip_moments(m, d)
-    q, V = inertia, S + A
+    q = inertia
+    V = S + A
     means = -losses[0] / 2 + eta * (eta * V * JJ - S * uJ), eta * (eta / q * V * JJ - A * uJ)
     fourth = eta**4 * V**2 * J4
     third = eta**3 * V * uJ3
     second = eta**2 * S * A * JJ
     mixed = eta**2 * uuJJ
     # With a constant eps, x and the slip would depend on each other by the speed alone.
-    normal, kick = -losses[0] / 4, eta**2 * V * ggJJ
+    normal = -losses[0] / 4
+    kick = eta**2 * V * ggJJ
     square = fourth - 2 * S * third + S**2 * mixed + second
     square = square + losses[1] / 4 + 2 * normal * (kick - eta * S * gguJ)
     both = fourth / q - (A + S / q) * third + S * A * mixed - second
@@ -530,7 +539,7 @@ def _chebyshev(num_nodes: int) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def _derivative_matrix(num_nodes: int) -> np.ndarray:
-    """Matrix from the coefficients of a Chebyshev series to those of its derivative."""
+    """Matrix that takes the coefficients of a Chebyshev series to its derivative."""
     return np.pad(np.polynomial.chebyshev.chebder(np.eye(num_nodes)), ((0, 1), (0, 0)))
 
 

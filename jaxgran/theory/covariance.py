@@ -284,8 +284,11 @@ def process(
     """
     if scene.sizes is not None:
         return _process_of_sizes(scene, density, d, mean)
-    surface, drag, drive = scene.surface, scene.drag, scene.drive
-    spins, d_rot = mean.spins, NUM_SPIN_COMPONENTS[d]
+    surface = scene.surface
+    drag = scene.drag
+    drive = scene.drive
+    spins = mean.spins
+    d_rot = NUM_SPIN_COMPONENTS[d]
     cumulants = surface is not None and spins.correlation is not None
     inertia = 1.0 if surface is None else surface.inertia
     exp_y = spins.rotation + ROTATION_OFFSET
@@ -306,7 +309,8 @@ def process(
         _, of_y, of_S, of_A = steps
         shifted = exp_y * jnp.exp(STEP * of_y)
         rotation = shifted - ROTATION_OFFSET
-        S, A = 2 + 2 * STEP * of_S, 2 * rotation / inertia + step_of_A * of_A
+        S = 2 + 2 * STEP * of_S
+        A = 2 * rotation / inertia + step_of_A * of_A
         each_kind = jax.vmap(lambda impacts: energy_moments(impacts, surface, S, A, d))
         gains, squares = each_kind(impacts)
         gains = jnp.sum(gains, 0)
@@ -385,7 +389,8 @@ def _process_of_sizes(
             of_both = of_both - jnp.stack([of_T, drag[0] - drag[1]])
         return of_both, pairs, changes
 
-    T, q = mean.log_temperature, mean.size_ratio
+    T = mean.log_temperature
+    q = mean.size_ratio
     steps = jnp.asarray([[STEP, -STEP, 0, 0, 0], [0, 0, STEP, -STEP, 0]], T.dtype)
     pairs: PairRates
     at, pairs, changes = jax.vmap(rates)(T + steps[0], q + steps[1])

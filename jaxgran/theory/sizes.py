@@ -19,7 +19,7 @@ Given u the normal velocity of sphere i is Gaussian with the mean ``(T_i/w) u`` 
     Delta_i = (a_i^2 k^2 - 2 a_i k T_i/w) u^2 - 2 a_i k u xi,    xi Gaussian, <xi^2> = T_i T_j/w,
 
 and v_j^2 likewise with ``+ 2 a_j k u xi``: the deviation xi of the velocity of the centre exchanges
-energy between the two. eps is that of equal spheres of the same effective radius and mass.
+energy between the two. Equal spheres of the same effective radius and mass have the same eps.
 
 Reference: Garzo & Dufty, Phys. Rev. E 60, 5706 (1999), for mixtures of constant restitution.
 """
@@ -65,13 +65,15 @@ def energy_ratio(spread: ArrayLike, ratio: ArrayLike) -> Float[Array, "..."]:
         spread: s.
         ratio: q, any shape.
     """
-    spread, ratio = jnp.asarray(spread), jnp.asarray(ratio)
+    spread = jnp.asarray(spread)
+    ratio = jnp.asarray(ratio)
     return 1 - spread * (3 + spread**2) / (1 + 3 * spread**2) * jnp.tanh(ratio / 2)
 
 
 def energy_slope(spread: ArrayLike, ratio: ArrayLike) -> Float[Array, "..."]:
     """Return the derivative of the logarithm of `energy_ratio` in q."""
-    spread, ratio = jnp.asarray(spread), jnp.asarray(ratio)
+    spread = jnp.asarray(spread)
+    ratio = jnp.asarray(ratio)
     change = spread * (3 + spread**2) / (1 + 3 * spread**2) / (2 * jnp.cosh(ratio / 2) ** 2)
     return -change / energy_ratio(spread, ratio)
 
@@ -99,7 +101,8 @@ def pair_rates(
     weights = weights * (1 + sonine / 16 * (g**2 * (g**2 - 6) + 3))
 
     def of_pair(law: Any, pair: Array) -> tuple[Array, Array, Array]:
-        own, mass = T[pair], masses[pair]
+        own = T[pair]
+        mass = masses[pair]
         variance = jnp.sum(own)
         a = mass[::-1] / jnp.sum(mass)
         share = own / variance

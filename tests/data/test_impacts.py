@@ -113,7 +113,7 @@ VELOCITIES = "nx,ny,nz,vx,vy,vz,vx_after,vy_after,vz_after,v_err"
             "two definitions of the tangential restitution",
         ),
         ("v,eps,eps_err,eps_t\n", "have eps_t without the tangential speed: give v_n,v_t, or v,an"),
-        ("v_n,v_t,eps,eps_err\n", "name those of a drop test v_n,v_t,eps,eps_err,eps_t,eps_t_err"),
+        ("v_n,v_t,eps,eps_err\n", "a drop test needs v_n,v_t,eps,eps_err,eps_t,eps_t_err"),
         ("vx,vy,vz,vx_after,vy_after,vz_after,v_err\n", r"no normal \(nx, ny, nz\): add nx,ny,nz"),
         (f"{VELOCITIES}\n0,0,1,0,0,-1,0,0,.9,.01\n", "if the spheres do not rotate .* spin_bef"),
         (f"{VELOCITIES}\n0,0,2,0,0,-1,0,0,.9,.01\n", "the normal nx,ny,nz has the length 2"),

@@ -247,7 +247,7 @@ def test_what_does_not_stand_between_the_walls_is_refused():
     for start, words in (
         (at_rest([-1e-4, middle, middle]), "sphere 7 of replica 0 .* outside of the walls.* 0.05"),
         (at_rest([middle, SIDE - 0.9e-3, middle]), "less than its radius, 0.001 m, from a wall"),
-        (at_rest(side=1.1 * SIDE), "start.box_side is .* diameters, that of the gas"),
+        (at_rest(side=1.1 * SIDE), "start.box_side is .* diameters, but the box of the gas has"),
         (at_rest(angular_velocity=np.ones((1, 50, 3))), "HardSpheres draws the angular velocities"),
     ):
         with pytest.raises(ValueError, match=words):

@@ -264,5 +264,5 @@ def test_ambiguous_wall_sides_are_refused():
     box = dataclasses.replace(GAS, container=walls)
     curves = sweep(jax.vmap(lambda a: box.replace(dissipative_constant=a))(A))
     assert curves.temperature.shape == (5, 3)
-    with pytest.raises(ValueError, match="sides of one box or those of 3 cubes"):
+    with pytest.raises(ValueError, match="one box with these sides, or 3 cubes"):
         sweep(box.replace(temperature=jnp.ones(3) * 0.01))

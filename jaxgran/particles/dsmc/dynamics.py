@@ -183,7 +183,7 @@ class DSMCDynamics(AbstractDynamics):
     def initial(self, start: Any, key: PRNGKeyArray, directions: Any) -> DSMCState:
         """Return the state at t = 0, with Maxwellian velocities.
 
-        T is then 1, and T_rot that of the scene.
+        T is then 1, and T_rot as in the scene.
         """
         scene = self.scene
         (replicas, n, d) = self.shape

@@ -1,6 +1,6 @@
 """Forces on soft spheres, and the time steps of the spheres that may touch within a block.
 
-Units are those of `jaxgran.scene.gas.SphereScene`. Spins are (sigma/2) w.
+Units: see `jaxgran.scene.gas.SphereScene`. Spins are (sigma/2) w.
 
 Without drag a sphere flies freely between contacts. With drag ``dv/dt = -gamma v``, so that
 ``v(t) = v exp(-gamma t)`` and ``x(t) = x + v (1 - exp(-gamma t))/gamma``: the path is that of free
