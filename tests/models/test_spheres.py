@@ -114,7 +114,7 @@ def test_a_plan_is_of_its_model():
 
 def test_large_boxes_are_searched_by_cells():
     gas = hard_gas()
-    engines = [HardSpheres(n).sized_for(gas).plan.engine for n in (1000, 4096, 50_000)]
+    engines = [HardSpheres(n).sized_for(gas)._sizes.engine for n in (1000, 4096, 50_000)]
     assert engines == ["sweep", "sweep", "cells"]
 
 
