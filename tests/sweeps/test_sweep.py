@@ -13,7 +13,7 @@ import pytest
 
 import jaxgran
 from jaxgran import observables
-from tests.beads import assert_same, glass_beads, without
+from tests.beads import assert_same, glass_beads, hard_gas, without
 from tests.sweeps.process import TIMES, members
 
 GAS, GASES = glass_beads(), members(5)
@@ -186,6 +186,17 @@ def test_members_that_fail_are_nan_and_do_not_end_the_others():
     assert warned[0].filename == __file__  # the line of the caller
     assert list(curves.status) == [0, 8192, 0]
     assert "does not support" in jaxgran.explain_status(curves.status[1])
+
+
+def test_gases_share_one_search_for_pairs():
+    sized_for_all = sys.modules["jaxgran.sweep"]._sized_for_all
+    model = jaxgran.HardSpheres(5000)
+    dilute, dense = (hard_gas(packing_fraction=phi) for phi in (0.05, 0.4))
+    assert [model.sized_for(gas)._sizes.engine for gas in (dilute, dense)] == ["sweep", "cells"]
+    both = sized_for_all(model, [dilute, dense], 2.0)
+    assert both.neighbours == both._sizes.engine == "cells"
+    cells = dataclasses.replace(model, neighbours="cells").sized_for(dense)
+    assert both._sizes.capacity.lookahead == cells._sizes.capacity.lookahead
 
 
 @pytest.mark.slow  # programs of particles are compiled
