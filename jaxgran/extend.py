@@ -1,9 +1,9 @@
-"""What laws of restitution and models of your own are made of.
+"""Base classes for your own laws of restitution and models.
 
-A law is a subclass of `RestitutionLaw`, whose numbers have a range each, a `Domain`; one that
-depends on the spheres returns a `ReducedLaw`. A model is a subclass of `AbstractModel`: it runs
-with the options of a `Run`, estimates its error with an `ErrorModel` and lists what it leaves out,
-each as a `Limitation`.
+A law is a subclass of `RestitutionLaw`; a `Domain` gives the range of each parameter. A law that
+depends on the size or the mass of the spheres returns a `ReducedLaw`. A model is a subclass of
+`AbstractModel`: it runs with the options of a `Run`, estimates its error with an `ErrorModel` and
+lists what it leaves out, each as a `Limitation`.
 
 >>> from jaxgran import extend
 >>> class Plastic(extend.RestitutionLaw):

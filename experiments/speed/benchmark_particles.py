@@ -164,8 +164,18 @@ def dsmc(options: Options) -> Iterator[dict]:
 
 
 C_PROGRAMS = Path(__file__).parent
-RESTITUTION, DISSIPATION = 0.9, 0.3
-"""Constant eps, and the dissipation parameter of viscoelastic spheres at the speed 1 in C."""
+RESTITUTION = 0.9
+DISSIPATION = 0.3
+"""Dissipation parameter of viscoelastic spheres, in C at the speed 1."""
+
+GOALS = {
+    ("hard spheres", 256): (4.0, 4.0),
+    ("hard spheres", 4096): (1.5, 1.3),
+    ("hard spheres", 50_000): (3.0, 2.0),
+    ("DSMC", 10_000): (3.0, 2.5),
+    ("DSMC", 1_000_000): (1.0, 1.0),
+}
+"""Ratios to C that are aimed at: at phi = .05 and .25, of constant and viscoelastic eps."""
 
 
 def references(options: Options) -> Iterator[dict]:
@@ -180,6 +190,7 @@ def references(options: Options) -> Iterator[dict]:
             start = cool(hard_beads(phi, RESTITUTION), [0.0], jaxgran.HardSpheres(size)).particles
             model = jaxgran.HardSpheres(size, start=start)
             row = {"program": "hard spheres", "num_particles": size, "packing_fraction": phi}
+            row["goal"] = GOALS["hard spheres", size][phi > 0.1]
             yield row | beside_c(command, hard_beads(phi, RESTITUTION), model, each, repeats)
         direct = compiled_by_c("dsmc", folder)
         for size, viscoelastic in itertools.product(dsmc_sizes, (False, True)):
@@ -187,6 +198,7 @@ def references(options: Options) -> Iterator[dict]:
             gas = beads(PACKING, DISSIPATION) if viscoelastic else hard_beads(PACKING, RESTITUTION)
             command = direct, size, each, -DISSIPATION if viscoelastic else RESTITUTION
             row = {"program": "DSMC", "num_particles": size, "viscoelastic": viscoelastic}
+            row["goal"] = GOALS["DSMC", size][viscoelastic]
             yield row | beside_c(command, gas, jaxgran.DSMC(size), each, repeats)
 
 
@@ -254,6 +266,7 @@ def batch_row(soft: jaxgran.Gas, gas: jaxgran.Gas, model, count: int, repeats: i
     took = alternately(runs, 1 + repeats)  # the first ones compile
     loop_s, batch_s = (np.array(each[1:]) for each in took.values())
     row = {"model": model.name, "batch": count, "batch_s": float(np.median(batch_s))}
+    row["goal"] = 2.5 if model.stochastic else 4.0
     return row | {"loop_s": float(np.median(loop_s)), "ratio": float(np.median(loop_s / batch_s))}
 
 

@@ -193,7 +193,8 @@ class _Motion(NamedTuple):
         side: of a periodic box, m; infinite without one.
         num_frames: number of frames.
         frame_time: typical time between frames, s.
-        sums: sums over all rows before one of 1, t, t^2, x, t x and x^2, shape (rows + 1, 4 + 2 d).
+        terms: 1, t, t^2, x, t x and x^2 from the origin, and a last row of zeros, shape (rows + 1,
+            4 + 2 d).
         origin: time, s, and position, m, of the first row of each particle, shape (rows, 1 + d).
     """
 
@@ -205,7 +206,7 @@ class _Motion(NamedTuple):
     side: float
     num_frames: int
     frame_time: float
-    sums: Float[np.ndarray, "more sums"]
+    terms: Float[np.ndarray, "more terms"]
     origin: Float[np.ndarray, "rows e"]
 
     @classmethod
@@ -240,10 +241,14 @@ class _Motion(NamedTuple):
             crossed = np.round(np.diff(position, axis=0) / side) * same[:, None]
             images = np.concatenate([np.zeros((1, position.shape[1])), np.cumsum(crossed, axis=0)])
             position = position - side * images
-        error = 0.0
         if "localisation_error" in header:
             error = files.header_number(header, "localisation_error")
-        if error <= 0:
+            if not error > 0:
+                raise ValueError(
+                    f"localisation_error must be > 0 m, got {error:g}. Leave it out, and it is "
+                    "estimated from the tracks"
+                )
+        else:
             error = _scatter_of_second_differences(particle, position)
         first = np.flatnonzero(np.append(True, ~same))
         begin = first[np.cumsum(np.append(True, ~same)) - 1]
@@ -251,10 +256,10 @@ class _Motion(NamedTuple):
         t = time - origin[:, 0]
         x = position - origin[:, 1:]
         terms = np.column_stack([np.ones_like(t), t, t**2, x, t[:, None] * x, np.sum(x**2, axis=1)])
-        sums = np.concatenate([np.zeros((1, terms.shape[1])), np.cumsum(terms, axis=0)])
+        terms = np.concatenate([terms, np.zeros((1, terms.shape[1]))])
         frame_time = float(np.median(np.diff(times)))
         return cls(
-            particle, frame, time, position, error, side, times.size, frame_time, sums, origin
+            particle, frame, time, position, error, side, times.size, frame_time, terms, origin
         )
 
     def rows_from(self, particle: np.ndarray, frame: np.ndarray) -> np.ndarray:
@@ -264,10 +269,22 @@ class _Motion(NamedTuple):
             keys, particle * self.num_frames + np.clip(frame, 0, self.num_frames)
         )
 
+    def _sums(self, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Return sums of the terms over rows from `begin` to before `end`.
+
+        Each is summed by itself: differences of sums over all rows would lose digits.
+        """
+        order = np.argsort(begin, kind="stable")
+        bounds = np.stack([begin, np.maximum(begin, end)], axis=1)[order]
+        sums = np.empty((len(begin), self.terms.shape[1]))
+        if len(begin):
+            sums[order] = np.add.reduceat(self.terms, bounds.ravel(), axis=0)[::2]
+        return np.where((end > begin)[:, None], sums, 0.0)
+
     def lines(self, begin: np.ndarray, end: np.ndarray) -> "_Lines":
         """Return the lines of least squares through rows from `begin` to before `end`."""
         d = self.position.shape[1]
-        count, t, t2, *rest = (self.sums[end] - self.sums[np.minimum(begin, end)]).T
+        count, t, t2, *rest = self._sums(begin, end).T
         x = np.stack(rest[:d], axis=1)
         tx = np.stack(rest[d : 2 * d], axis=1)
         safe = np.maximum(count, 1)
@@ -416,6 +433,10 @@ def _encounters_of_spheres(motion: _Motion, diameter: float) -> _Events:
     """Return encounters of two spheres that may be impacts, by their least distance."""
     same = motion.particle[1:] == motion.particle[:-1]
     steps = np.linalg.norm(np.diff(motion.position, axis=0), axis=1)[same]
+    if steps.size == 0:
+        raise ValueError(
+            "no particle occurs in two frames. Give each particle the same id in all frames"
+        )
     blur = 2**0.5 * motion.error
     reach = diameter + float(np.quantile(steps, FAST_STEP)) + 4 * blur
     a, b = _near_rows(motion, reach)

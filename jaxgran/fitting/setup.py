@@ -4,6 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
+import jax
 import numpy as np
 
 from jaxgran.data.drop_test import DropTest
@@ -80,16 +81,19 @@ def build_problem(request: Request) -> tuple[Problem, np.ndarray, list[str]]:
     problem = Problem.build(
         tuple(measurements), model, request.names, request.separate, request.priors
     )
-    for m in measurements:  # drop tests begin at the shared values of the first curve
+    # Drop tests start from the values of the first curve.
+    for m in measurements:
         if isinstance(m, DropRows) and problem.curves:
             shared = guesses[problem.curves[0].label]
             guesses[m.label] = with_values_of(m.gas, shared, request.names)
-    for label, gas in guesses.items():  # and curves at what impacts alone tell
+    # Parameters that impacts alone determine start from the drop tests.
+    for label, gas in guesses.items():
         guesses[label] = gas.replace(**{n: x for n, x in of_impacts.items() if n in gas.domains})
     first = problem.flat(_values_of_guesses(problem, guesses))
-    with ThreadPoolExecutor(1) as compiling:  # two programs are compiled at the same time
-        compiling.submit(problem.compile_innovations, first)
+    with ThreadPoolExecutor(1) as thread:  # two programs are compiled at the same time
+        compiled = thread.submit(_compile_innovations, problem, first, *_configuration())
         problem = problem_with_rate_errors(problem, first)
+        compiled.result()
     if request.start is not None:
         complete = {
             label: with_values_of(guess, request.start, free) for label, guess in guesses.items()
@@ -98,6 +102,17 @@ def build_problem(request: Request) -> tuple[Problem, np.ndarray, list[str]]:
         starts = [(problem.evaluate(flat).value, flat) for flat in (first, other)]
         first = min(starts, key=lambda pair: (np.isnan(pair[0]), pair[0]))[1]
     return problem, first, notes
+
+
+def _configuration() -> tuple[bool, Any]:
+    """Return the configuration of JAX that a user may set for one thread alone."""
+    config: Any = jax.config
+    return config.jax_enable_x64, config.jax_default_device
+
+
+def _compile_innovations(problem: Problem, flat: np.ndarray, x64: bool, device: Any) -> None:
+    with jax.enable_x64(x64), jax.default_device(device):
+        problem.compile_innovations(flat)
 
 
 def problem_with_rate_errors(problem: Problem, flat: np.ndarray) -> Problem:

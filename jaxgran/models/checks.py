@@ -38,7 +38,12 @@ POSITIONS_NEEDED = "This scene needs particles with positions."
 
 
 def checked_gas(gas: Any) -> Gas:
-    """Return the gas. Raise ValueError if it is not a `Gas`, or a batch outside of `jax.vmap`."""
+    """Return the gas.
+
+    Raises:
+        ValueError: if it is not a `Gas`, or a batch outside of `jax.vmap`, or a parameter is out of
+            range.
+    """
     if not isinstance(gas, Gas):
         raise ValueError(f"gas must be a jaxgran.Gas, got {type(gas).__name__}")
     gas.check_single()
@@ -86,7 +91,7 @@ def check_cools(gas: Gas) -> None:
             "impacts in this gas, but eps must be a number >= 0: limit it, as in "
             "jnp.clip(eps, 0.0, 1.0), or lower T_0"
         )
-    if scales.cooling_rate < 0:
+    if not scales.cooling_rate >= 0:
         raise ValueError(
             "the law of restitution makes this gas heat up: its mean eps over impacts is above 1 "
             "(a truncated series beyond its range). Lower T_0 or A, or use another law."
@@ -95,7 +100,8 @@ def check_cools(gas: Gas) -> None:
 
 def check_softness(gas: Gas) -> None:
     """Raise ValueError if soft contacts would stop the cooling, at T_0 or at the highest T."""
-    hottest = 1.0 if gas.drive is None else float(_max_thermal_speed(gas))
+    with jax.ensure_compile_time_eval():
+        hottest = 1.0 if gas.drive is None else float(_max_thermal_speed(gas))
     highest = float(gas.temperature) * hottest**2
     check_softness_at(gas, hottest, float(scales_at(gas, highest).softness))
 
@@ -246,13 +252,15 @@ def describe_walls(gas: Gas, num_particles: int) -> str:
     ``<|v_x|>/<v> = 1/2`` (2/pi in a plane).
     """
     scales = scales_at(gas)
-    long = scales.box_side(num_particles, gas.dimension) / float(scales.mean_free_path)
+    path = float(scales.mean_free_path)
     if gas.container is not None:
-        return f"has walls, {long:.2g} mean free paths apart"
-    often = gas.dimension / long * {2: 2 / np.pi, 3: 0.5}[gas.dimension]
+        apart = float(np.min(gas.container.side)) / path
+        return f"has walls, {apart:.2g} mean free paths apart"
+    length = scales.box_side(num_particles, gas.dimension) / path
+    often = gas.dimension / length * {2: 2 / np.pi, 3: 0.5}[gas.dimension]
     return (
-        f"is {long:.2g} mean free paths long: if it has walls, spheres meet them {often:.2g} times "
-        "as often as each other, and the gas needs container=Walls(...)"
+        f"is {length:.2g} mean free paths long: if it has walls, spheres meet them {often:.2g} "
+        "times as often as each other, and the gas needs container=Walls(...)"
     )
 
 

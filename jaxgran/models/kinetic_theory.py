@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxgran._utils import status, validation
 from jaxgran._utils.tracing import (
     any_traced,
+    array_module,
     in_compiled_code,
     pad_to,
     truncate_to,
@@ -203,12 +204,13 @@ class KineticTheory(AbstractModel):
         """
         if gas.container is not None or gas.diameter_sd is not None:
             return None
-        correlation = 0.85 * np.minimum(gas.packing_fraction, 0.2)
+        numpy = array_module(gas.packing_fraction)  # NumPy compiles nothing
+        correlation = 0.85 * numpy.minimum(gas.packing_fraction, 0.2)
         second = self.order > 2 and "sonine" in self.corrections
         sonine = 0.005 if second else {2: 0.024, 3: 0.017}[gas.dimension]
         if gas.surface is not None:  # spins and velocities are correlated: DSMC, beta_t = .5
             sonine += 0.07
-        return np.hypot(sonine, correlation)
+        return numpy.hypot(sonine, correlation)
 
     def cooling_rate(self, gas: Gas) -> Float[Array, ""]:
         """Return ``-d ln T/dt`` at t = 0, 1/s, of a Maxwellian gas; < 0 if the law heats it."""

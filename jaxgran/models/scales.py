@@ -1,6 +1,5 @@
 """Numbers that describe a gas at some temperatures, computed by one program for a kind of gas."""
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxgran._utils.tracing import fast_compilation, grid_size, pad_to
+from jaxgran._utils.tracing import grid_size, pad_to
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import NODES
 from jaxgran.scene.laws import Viscoelastic
@@ -24,7 +23,7 @@ MIN_LENGTH = 128
 
 
 class Scales(NamedTuple):
-    """Numbers of a Maxwellian gas at some temperatures, arrays of NumPy of shape (temperatures,).
+    """Numbers of a Maxwellian gas at one temperature, or arrays of NumPy for some temperatures.
 
     Attributes:
         mean_free_time, mean_free_path: s, m.
@@ -52,7 +51,7 @@ class Scales(NamedTuple):
     beta: Any
 
     def box_side(self, num_particles: int, dimension: int) -> float:
-        """Side of the cube (of the square if d = 2) of N spheres, m."""
+        """Side of the cube (of the square if d = 2) of N spheres, m; of scales at one T."""
         return float((num_particles * self.volume) ** (1 / dimension))
 
 
@@ -61,12 +60,16 @@ def scales_at(gas: Gas, temperature: ArrayLike | None = None) -> Scales:
 
     Args:
         gas: the scene.
-        temperature: T, m^2/s^2, T_0 by default; shape () or (temperatures,), as that of the result.
+        temperature: T, m^2/s^2, shape () or (temperatures,); T_0 by default.
+
+    Returns:
+        The scales, of the shape of the temperature.
     """
     temperature = gas.temperature if temperature is None else temperature
     T = np.atleast_1d(temperature)
-    padded = pad_to(T, max(grid_size(T.size), MIN_LENGTH))
-    found = _compiled(jax.default_backend())(gas, padded)
+    with jax.ensure_compile_time_eval():  # a known gas may be checked while jax.jit traces
+        padded = pad_to(T, max(grid_size(T.size), MIN_LENGTH))
+        found = _scales(gas, padded)
     used = slice(T.size) if np.ndim(temperature) else 0
     return jax.tree.map(lambda x: np.asarray(x)[used], found)
 
@@ -86,6 +89,7 @@ def _cooling(gas: Gas) -> tuple[Float[Array, ""], Float[Array, ""]]:
     return rate, jnp.min(law.restitution(speeds))
 
 
+@eqx.filter_jit
 def _scales(gas: Gas, temperature: Float[Array, "temperatures"]) -> Scales:
     def at(temperature):
         now = gas.replace(temperature=temperature)
@@ -108,9 +112,3 @@ def _scales(gas: Gas, temperature: Float[Array, "temperatures"]) -> Scales:
         )
 
     return jax.vmap(at)(temperature)
-
-
-@cache
-def _compiled(backend: str) -> Any:
-    options: dict[str, Any] = {"compiler_options": fast_compilation(backend)}
-    return eqx.filter_jit(_scales, **options)

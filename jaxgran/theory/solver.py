@@ -238,7 +238,8 @@ class MomentSolver(NamedTuple):
             times_along: tangents of the times.
 
         Returns:
-            the moments, shape (times,), and their derivatives, shape (directions, times).
+            The moments, shape (times,); their derivatives, shape (directions, times); and the
+            status. All are nan unless it is ok.
         """
         dtype = times.dtype
         leaves = [jnp.asarray(x, dtype) for x in jax.tree.leaves(scene_along)]

@@ -1,5 +1,7 @@
 """Kinetic theory against the reference solutions, and its numerics over many decades."""
 
+import dataclasses
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -102,6 +104,15 @@ def test_stiff_solver_for_nearly_elastic_gases():
     formula = paper_temperature(tau, gas.delta)
     # The expansion is right to delta here; softness 0.8 % of the rate, a_2 less.
     np.testing.assert_allclose(curve.temperature / gas.temperature, formula, rtol=0.03)
+
+
+@pytest.mark.parametrize("drive", [None, jaxgran.WhiteNoise(1e-4)])
+def test_a_known_gas_is_checked_while_times_are_traced(drive):
+    gas = dataclasses.replace(glass_beads(0.15), drive=drive)
+    times = jnp.array([0.0, 1.0]) * gas.mean_free_time
+    curve = jaxgran.cool(gas, times)
+    traced = jax.jit(lambda t: jaxgran.cool(gas, t).temperature)(times)
+    np.testing.assert_allclose(traced, curve.temperature, rtol=1e-6)
 
 
 def test_another_number_of_times_compiles_nothing(caplog):
