@@ -1,8 +1,11 @@
 """Values that a JAX transformation traces, and operations on concrete arrays."""
 
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -115,6 +118,13 @@ def fast_compilation(backend: str) -> dict[str, Any]:
         return {}
     emitters = {} if jax.__version_info__ >= (0, 11) else {"xla_cpu_use_fusion_emitters": False}
     return {"xla_backend_optimization_level": 1} | emitters
+
+
+@cache
+def fast_jit(function: Callable[..., Any], backend: str) -> Any:
+    """Return a function, compiled once for all, with the options of `fast_compilation`."""
+    options: dict[str, Any] = {"compiler_options": fast_compilation(backend)}
+    return eqx.filter_jit(function, **options)
 
 
 def nan_where(failed: Bool[Array, "..."], x: Array) -> Array:

@@ -8,15 +8,13 @@ differences along the tangents of the curve: one call for all unknowns, by a sec
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxgran._utils.tracing import fast_compilation
+from jaxgran._utils.tracing import fast_jit
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.likelihood import Nodes, filtered, innovations
 from jaxgran.fitting.parameters import as_floats, power_of_line, with_parameters
@@ -225,7 +223,7 @@ class PredictedCurve:
             batch.size_ratio,
             self.by_size_ratio(gas, batch.size_ratio),
         )
-        compiled = _compiled(innovations, jax.default_backend())
+        compiled = fast_jit(innovations, jax.default_backend())
         found = compiled(gas, nodes, compared, T / (T + floor), observed, noise)
         # Values of T are followed by those of T_rot.
         values, variances, changes = (
@@ -265,7 +263,7 @@ class PredictedCurve:
         gas = jax.tree.map(lambda x: np.asarray(x)[None], self.gas)
         one = np.ones((self.times.size, 1))
         columns = whole[..., None]
-        compiled = _compiled(filtered, jax.default_backend())
+        compiled = fast_jit(filtered, jax.default_backend())
         found = compiled(gas, nodes, columns, variances, one, observed.used, noise)
         values, spread = (np.asarray(x)[self.place, ..., 0] for x in found)
         values = values / np.sqrt(spread)[..., None]
@@ -491,9 +489,3 @@ def _collisions(gas: Gas, times: np.ndarray, T: np.ndarray) -> np.ndarray:
 def _batch_size(count: int) -> int:
     """Return the smallest of 8, 16, 32, ... that is >= `count`, so that few sizes are compiled."""
     return max(8, 1 << (count - 1).bit_length())
-
-
-@cache
-def _compiled(function: Callable, backend: str) -> Any:
-    options: dict[str, Any] = {"compiler_options": fast_compilation(backend)}
-    return eqx.filter_jit(function, **options)

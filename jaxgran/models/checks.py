@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxgran._utils import status
@@ -28,6 +27,9 @@ OVERLAP_LIMIT = 0.01
 
 CORRELATED_PACKING = {2: 0.4, 3: 0.25}
 """Packing fraction above which successive collisions are correlated, by dimension."""
+
+CRYSTAL_PACKING = {2: 0.72, 3: 0.545}
+"""Packing fraction above which hard disks and spheres are a crystal, by dimension."""
 
 MAX_WALL_DISTANCE = 50.0
 """Distance of walls, in mean free paths, up to which theory was compared with hard spheres: the
@@ -231,18 +233,14 @@ def limitations_of_homogeneity(gas: Gas, num_particles: int | None) -> tuple[Lim
                 f"L_c = {critical / diameter:.3g}: a flow grows, and clusters after it"
             )
     limitations = [Limitation(words, False, POSITIONS_NEEDED) for words in effects]
-    phi = float(gas.packing_fraction)
-    if phi > CRYSTAL[gas.dimension]:
+    limit = CRYSTAL_PACKING[gas.dimension]
+    if phi > limit:
         words = (
-            f"packing_fraction {phi:.3g} is above {CRYSTAL[gas.dimension]:g}, where spheres form a "
-            "crystal or a glass, and the contact value holds for a fluid"
+            f"packing_fraction {phi:.3g} is above {limit:g}, where spheres form a crystal or a "
+            "glass, and the contact value holds for a fluid"
         )
         limitations.append(Limitation(words, True, POSITIONS_NEEDED))
     return tuple(limitations)
-
-
-CRYSTAL = {2: 0.72, 3: 0.545}
-"""Packing fraction above which hard disks and spheres are a crystal, by dimension."""
 
 
 def describe_walls(gas: Gas, num_particles: int) -> str:
@@ -340,7 +338,7 @@ def nan_unless(
 
 def check_packing(gas: Gas, num_particles: int, random: bool) -> None:
     """Raise ValueError if the gas is too dense for a random start, or the box too small."""
-    if isinstance(gas.packing_fraction, Tracer) or isinstance(gas.diameter, Tracer):
+    if any_traced(gas.packing_fraction, gas.diameter):
         return
     limit = PACKING_LIMIT[gas.dimension]
     phi = float(jnp.max(gas.packing_fraction))

@@ -7,16 +7,14 @@ alternative explanations of a curve are other numbers of the same program.
 
 import dataclasses
 from collections.abc import Collection
-from functools import cache
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxgran._utils.tracing import as_jax_arrays, fast_compilation, grid_size, pad_to
+from jaxgran._utils.tracing import as_jax_arrays, fast_jit, grid_size, pad_to
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.elements import Rough, StokesDrag, Walls
@@ -108,7 +106,7 @@ def linearise(
     padded = pad_to(times, grid_size(size))
     sizes = {name: np.size(x) for name, x in gas.parameters.items() if name in names}
     directions, delay = _directions(gas, sizes)
-    program = _compiled(jax.default_backend())
+    program = fast_jit(_linearised, jax.default_backend())
     computed = program(model, gas, padded, np.asarray(tolerance), directions, delay)
     values, slopes = jax.tree.map(np.asarray, computed)
     values = {name: x[:size] if x.ndim else x for name, x in values.items()}
@@ -171,9 +169,3 @@ def _linearised(
 
 def _known(fields: dict[str, Array | None]) -> dict[str, Array]:
     return {name: value for name, value in fields.items() if value is not None}
-
-
-@cache
-def _compiled(backend: str) -> Any:
-    options: dict[str, Any] = {"compiler_options": fast_compilation(backend)}
-    return eqx.filter_jit(_linearised, **options)

@@ -42,8 +42,7 @@ MAX_AROUND = 2000
 EDGE_MARGIN = 1e-3
 """Relative margin of the edge of a cell over the cutoff."""
 
-
-OTHERS = {"sweep": "'cells' or 'jax-md'", "cells": "'jax-md'"}
+ALTERNATIVES = {"sweep": "'cells' or 'jax-md'", "cells": "'jax-md'"}
 """Methods that remain where one cannot be used, for messages."""
 
 
@@ -99,12 +98,12 @@ def num_words_ahead(engine: str, ahead: int, num_particles: int, num_runs: int) 
         ValueError: if the words of all particles are too many for 32-bit indices.
     """
     num_words = max(-(-ahead // WORD), 1)
-    num_runs = num_runs * num_particles
-    if num_words * num_runs >= 2**31:
+    total_runs = num_runs * num_particles
+    if num_words * total_runs >= 2**31:
         raise ValueError(
             f"neighbours={engine!r} over {num_particles} particles cannot look {ahead} particles "
-            f"ahead: its indices have 32 bits, which allow {(2**31 - 1) // num_runs * WORD} "
-            f"ahead. Use neighbours={OTHERS[engine]}"
+            f"ahead: its indices have 32 bits, which allow {(2**31 - 1) // total_runs * WORD} "
+            f"ahead. Use neighbours={ALTERNATIVES[engine]}"
         )
     return num_words
 
@@ -160,8 +159,8 @@ def cells(
     """
     total, dimension = position.shape
     n = total // replicas
-    num_rows = (3 ** (dimension - 1) + 1) // 2
-    num_words = num_words_ahead("cells", min(ahead, n), total, num_rows)
+    num_runs = (3 ** (dimension - 1) + 1) // 2
+    num_words = num_words_ahead("cells", min(ahead, n), total, num_runs)
     reach, square = reach_in_steps(cutoff, side, position)
     finite = jnp.all(jnp.isfinite(position))
     unit = jnp.where(finite, position / side, 0.0).T
@@ -211,13 +210,13 @@ def cells(
         block, _ = carry
         return (WORD * block < longest) & (block < num_words)
 
-    words = jnp.zeros((num_words, num_rows, total), jnp.uint32)
+    words = jnp.zeros((num_words, num_runs, total), jnp.uint32)
     _, words = jax.lax.while_loop(unfinished, compare_block, (jnp.zeros((), jnp.int32), words))
     first = jnp.concatenate(firsts)
 
     def pair_of(word: Int[Array, "rows"], bit: Int[Array, "rows"]) -> tuple[Array, Array]:
-        block = jax.lax.div(word, jnp.int32(num_rows * total))
-        run = word - block * jnp.int32(num_rows * total)
+        block = jax.lax.div(word, jnp.int32(num_runs * total))
+        run = word - block * jnp.int32(num_runs * total)
         other = take(first, run) + WORD * block + bit
         return take(order, jax.lax.rem(run, jnp.int32(total))), take(particle, other)
 

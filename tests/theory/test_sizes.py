@@ -9,8 +9,8 @@ import pytest
 
 import jaxgran
 from experiments.accuracy import size_statistics as runs
+from jaxgran._utils.tracing import fast_jit
 from jaxgran.fitting.likelihood import Nodes, filtered
-from jaxgran.fitting.prediction import _compiled
 from jaxgran.fitting.rows import Noise
 from jaxgran.scene.gas import reduced_scene
 from jaxgran.theory import sizes
@@ -196,7 +196,7 @@ def test_the_filter_is_the_covariance(energy):
     zero = jnp.zeros(())
     noise = Noise(jnp.full(1, 1 / 250), zero, jnp.zeros(times.size), zero, zero)
     batch = jax.tree.map(lambda x: jnp.asarray(x)[None], gas)
-    found, spread = _compiled(filtered, jax.default_backend())(
+    found, spread = fast_jit(filtered, jax.default_backend())(
         batch,
         nodes,
         jnp.asarray(residuals),
