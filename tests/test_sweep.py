@@ -14,7 +14,7 @@ import pytest
 import jaxgran
 from jaxgran import observables
 from tests.beads import assert_same, glass_beads, hard_gas, without
-from tests.sweeps.process import TIMES, members
+from tests.sweep_process import TIMES, members
 
 GAS, GASES = glass_beads(), members(5)
 A = GASES.value("dissipative_constant")
