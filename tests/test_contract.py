@@ -482,7 +482,7 @@ class TestContract:
         program = jax.jit(lambda x: jax.pure_callback(np.sin, x, x)).lower(1.0)
         assert HOST.search(program.as_text()) is not None
 
-    @of_models(lambda case: not isinstance(case.model, jaxgran.KineticTheory))  # see theory/test_solver
+    @of_models(lambda case: not isinstance(case.model, jaxgran.KineticTheory))  # see test_solver
     def test_reverse_is_forward(self, case):
         weights = jnp.arange(1.0, 5.0)
 
