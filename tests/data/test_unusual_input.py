@@ -1,18 +1,13 @@
-"""Curve files as people write them, and files whose header and columns contradict each other."""
+"""Curve files as people write them: read as meant, or refused with the line and a way out."""
 
 import codecs
 import gzip
 import io
 import os
-import re
 import threading
-import warnings
 import zipfile
-from datetime import timedelta
 
-import jax.numpy as jnp
 import numpy as np
-import pint
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -21,48 +16,29 @@ from pytest import approx
 import jaxgran
 from jaxgran import read_curve, read_measurement, write_curve
 from jaxgran.data import files
-from jaxgran.data.header import absent_of_header, gas_of_header, priors_of_header
-from jaxgran.data.tables import header_in_si
-
-KEYS = {"N": 2000, "eta": 0.04, "diameter": 0.003, "density": 1200, "Y": 2e7, "nu": 0.3, "T0": 0.02}
-
-
-def header_of(**keys):
-    """A header; `keys` replace its values, and None leaves one out."""
-    return {key: str(value) for key, value in (KEYS | keys).items() if value is not None}
-
-
-def gas_of(**keys):
-    return gas_of_header(header_of(**keys))[0]
-
-
-GAS = gas_of()
-TIMES = np.geomspace(0.02, 60.0, 40)
-TRUE_A = 4e-6
-CURVE = jaxgran.cool(GAS.replace(dissipative_constant=TRUE_A), TIMES)
-T = np.asarray(CURVE.temperature) * (1 + 0.005 * np.sin(7.0 * np.arange(40)))
-
-
-SPEED_XY = np.sqrt(np.pi / 2 * T)
-
-
-def text_of(names="t,T,T_err", columns=(TIMES, T, 0.01 * T), *, row=None, **keys):
-    """The text of a curve file; `keys` are of its header, and `row` replaces the fourth."""
-    rows = [",".join(f"{x:.9g}" for x in values) for values in zip(*columns, strict=True)]
-    if row is not None:
-        rows[3] = row
-    head = [f"# {key}: {value}" for key, value in header_of(**keys).items()]
-    return "\n".join([*head, names, *rows]) + "\n"
+from jaxgran.data.header import absent_of_header, priors_of_header
+from tests.data.curve_files import (
+    CURVE,
+    GAS,
+    HEAD,
+    IN_MM,
+    KEYS,
+    PLAIN,
+    SEMICOLONS,
+    SPEED_XY,
+    TIMES,
+    T,
+    assert_plain,
+    gas_of,
+    header_of,
+    said,
+    text_of,
+)
 
 
 def with_decimal_comma(text):
     return "\n".join(line if ":" in line else line.replace(".", ",") for line in text.split("\n"))
 
-
-PLAIN = text_of()
-HEAD = PLAIN.partition("t,T")[0]
-SEMICOLONS = PLAIN.replace(",", ";")
-IN_MM = text_of("t,T,T_err", (1e3 * TIMES, 1e6 * T, 1e4 * T))
 
 ENERGY = "t,energy\n0,4\n1,2\n2,1\n"
 
@@ -92,50 +68,6 @@ READ = {
     + text_of("t,T", (1e3 * TIMES, 1e6 * T), T0=2e4),
 }
 """Files that are read as the plain one, without a question."""
-
-QUESTIONED = {
-    "twice T": (text_of("t,T", (TIMES, 2 * T)), "1.9.* times .*T0 = 0.02.*twice T.*by 0.5"),
-    "<v^2>": (text_of("t,T", (TIMES, 3 * T)), "<v.2>, not divided by the dimension.*by 0.333"),
-    "projected speeds": (
-        text_of("t,mean_speed", (TIMES, SPEED_XY), T0=0.02 * np.pi**2 / 16),
-        "A 37 % too large: name the column mean_speed_xy",
-    ),
-    "projected speeds, true T0": (
-        text_of("t,mean_speed", (TIMES, SPEED_XY)),
-        "name the column mean_speed_xy, or multiply T by 1.62",
-    ),
-    "T of disks over 3": (text_of("t,T", (TIMES, 2 / 3 * T), dimension=2), "multiply it by 1.5"),
-    "one component over 3": (text_of("t,T", (TIMES, T / 3)), "one component over 3.* by 3"),
-    "T/T0, T0: 1": (text_of("t,T", (TIMES, T / 0.02), T0=1), "T0 is 1 m.*divided by its first"),
-    "the energy of all": (
-        text_of("t,energy", (TIMES, 3000 * float(GAS.mass) * T)),
-        "energy of all N .*total_energy, or multiply it by 0.0005",
-    ),
-    "T0 in kelvin, too": (
-        text_of("t,T", (TIMES, 1e17 * T), T0=2e15),
-        "T0 is 2e.15 m.2/s.2, .*kelvin times 1.38e-23 J/K over the mass",
-    ),
-    "an error larger than its value": (text_of(nu_err=0.4), "nu_err is 0.4 .* more than nu, 0.3"),
-    "T/T0": (text_of("t,T", (TIMES, T / 0.02)), "is the column T over T0.*multiply it by 0.02"),
-    "kelvin, untold": (
-        text_of("t,T", (TIMES, T * float(GAS.mass) / 1.380649e-23)),
-        "T is .*e.16 m.2/s.2, and usual is 0 to 900",
-    ),
-    "energy": (text_of("t,T", (TIMES, 1.5 * float(GAS.mass) * T)), "energy of a particle, in J"),
-    "T in mm^2/s^2": (text_of("t,T", (TIMES, 1e6 * T)), "T is .* and usual .* is it in mm.2/s.2"),
-    "t in ms": (text_of("t,T", (1e3 * TIMES, T)), "mean free times .* is t in ms"),
-    "t in steps": (text_of("t,T", (np.round(1e5 * TIMES), T)), "mean free times .* in steps"),
-    "a late clock": (text_of("t,T", (TIMES + 1000, T)), "T is T0 .* at t = 1000 s.*--free A t0"),
-    "density in g/cm^3": (text_of(density=1.2), "density is 1.2 kg/m.3.* in g/cm.3.*density: 1200"),
-    "diameter in mm": (
-        text_of(diameter=3),
-        "diameter is 3 m, and usual is .*: is it in mm.*diameter: 0.003",
-    ),
-    "Y_err in Pa, Y in GPa": (text_of(Y="0.02 GPa", Y_err=1e6), "Y_err is 1e.15 Pa, more than Y"),
-    "errors of other runs": (text_of(N=2e9), "T_err is at least .* larger .* N = 2e.09 particles"),
-    "N of one": (text_of(N=1), "T_err is at least .* smaller than the scatter of T of N = 1 "),
-}
-"""Files whose header and columns contradict each other, and the question that is asked."""
 
 REFUSED = {
     "the file is empty; it needs the columns": "",
@@ -182,21 +114,6 @@ REFUSED = {
 """What is said of a file that is refused, and the file."""
 
 
-def said(path, header=None):
-    """Read a file; return the curve, the gas and all questions."""
-    with warnings.catch_warnings(record=True) as questions:
-        warnings.simplefilter("always")
-        measurement = read_measurement(path, header)
-    words = "\n".join(str(question.message) for question in questions)
-    return measurement.curve, measurement.gas, words
-
-
-def assert_plain(curve, gas, rtol=1e-7):
-    np.testing.assert_allclose(curve.temperature, T, rtol=rtol)
-    numbers = gas.diameter, gas.density, gas.packing_fraction, gas.youngs_modulus, gas.temperature
-    np.testing.assert_allclose(numbers, (0.003, 1200, 0.04, 2e7, 0.02), rtol=1e-12)
-
-
 @pytest.mark.parametrize("name", READ)
 def test_files_are_read(name, write):
     curve, gas, words = said(write(READ[name]))
@@ -206,31 +123,10 @@ def test_files_are_read(name, write):
     np.testing.assert_allclose(curve.times[0], first, rtol=1e-9)
 
 
-@pytest.mark.parametrize("content, question", QUESTIONED.values(), ids=QUESTIONED)
-def test_files_are_questioned(content, question, write):
-    words = said(write(content))[2]
-    assert re.search(question, words.replace("\n", " ")), words
-
-
 @pytest.mark.parametrize("words", REFUSED)
 def test_files_are_refused(words, read):
     with pytest.raises(ValueError, match=f"(?s)curve.csv.*{words}"):
         read(REFUSED[words])
-
-
-@pytest.mark.parametrize("error", [None, pytest.param(0.01 * T, marks=pytest.mark.slow)])
-def test_an_outlier_is_named_with_its_row_and_left_out_for_comparison(error):
-    outlier = T * np.where(np.arange(40) == 12, 3.0, 1.0)
-    curve = jaxgran.CoolingCurve(TIMES, outlier, temperature_error=error)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the verdict
-        reasons = jaxgran.fit(jaxgran.Measurement(GAS, curve, num_particles=2000)).reasons
-    found = re.search(
-        r"outliers at t = .* s \(row 13\).*A is ([\d.e-]+) \+- ([\d.e-]+)", str(reasons)
-    )
-    value, uncertainty = map(float, found.groups())
-    # The wave in T is .5 %; with the outlier A is 15 % too small.
-    assert abs(value / TRUE_A - 1) < 0.01 and 0 < uncertainty < 0.02 * TRUE_A  # of 2000 grains
 
 
 ENCODINGS = ("utf-8", "utf-8-sig", "utf-16", "latin-1", "utf-32")
@@ -409,74 +305,6 @@ def test_calls_that_are_wrong_say_what_is_wanted(call, words):
         call()
 
 
-def test_eta_follows_from_N_and_the_container():
-    gas = gas_of(eta=None, container_side=0.09, wall_restitution=0.9)
-    assert float(gas.packing_fraction) == pytest.approx(2000 * np.pi / 6 * (0.003 / 0.09) ** 3)
-
-
-def test_a_header_says_what_is_known_of_the_measurement(write):
-    known = {"replicas": 3, "tracked": 120, "errors": "measured", "absent": "walls, drag"}
-    measurement = read_measurement(write(text_of(**known, eta_err=0.002)), {"N": 500})
-    assert measurement.num_particles == 500 and measurement.replicas == 3
-    assert measurement.tracked == 120 and measurement.errors_measured
-    assert measurement.absent == ("walls", "drag")
-    assert measurement.priors["packing_fraction"] == pytest.approx((0.04, 0.002))
-    plain = read_measurement(write(PLAIN))
-    assert plain.tracked is None and not plain.errors_measured
-    with pytest.raises(ValueError, match="errors: must be any or measured, got 'of T'"):
-        read_measurement(write(text_of(errors="of T")))
-
-
-def test_a_guess_is_where_a_fit_starts():
-    assert float(gas_of(beta_t="guess").value("tangential_restitution")) == 0
-
-
-def test_every_error_of_a_header_is_a_prior():
-    keys = {"wall_restitution": "0.9", "wall_restitution_err": "0.02", "beta_t": "0.5"}
-    assert priors_of_header(keys) == {"wall_coefficient": (0.9, 0.02)}
-    priors = priors_of_header({"diameter": "2e-3", "diameter_err": "1e-5", "density": "2500"})
-    assert priors["diameter"] == (2e-3, 1e-5) and priors["density"][0] == 2500
-    assert priors["density"][1] < 1  # so that the mass follows the diameter
-
-
-def test_a_setting_counts_before_anything_is_read(write):
-    speeds = text_of("t,mean_speed", (TIMES, SPEED_XY))
-    measurement = read_measurement(write(speeds), {"dimension": 2})
-    np.testing.assert_allclose(measurement.curve.temperature, T, rtol=1e-7)
-    energies = text_of("t,energy", (TIMES, 1.5 * float(GAS.mass) * T), density=None)
-    measurement = read_measurement(write(energies), {"density": "1.2 g/cm^3"})
-    np.testing.assert_allclose(measurement.curve.temperature, T, rtol=1e-7)
-    milli = text_of("t,T", (1e3 * TIMES, T))
-    told = {"time_unit": "ms", "speed_unit": "m/s", "T0": "0.02 m^2/s^2"}
-    measurement = read_measurement(write(milli), told)
-    np.testing.assert_allclose(measurement.curve.times, TIMES, rtol=1e-7)
-    np.testing.assert_allclose(measurement.curve.temperature, T, rtol=1e-7)
-
-
-@pytest.mark.parametrize("text", ["# T: 293 K (room)\n", "# D: 3 mm\n", "# t: noon\n"])
-def test_names_of_columns_are_free_in_the_header(text, write):
-    curve, gas, words = said(write(text + PLAIN))
-    assert_plain(curve, gas)
-    assert f"ignoring unknown header keys: {text[2]}" in words
-
-
-@pytest.mark.parametrize(
-    "text", ["8 x 6 x 4 cm", "80x60x40 mm", "0.08 × 0.06 × 0.04"], ids=["cm", "mm", "metres"]
-)
-def test_a_container_has_three_sides(text):
-    header = header_of(container_side=text, wall_restitution=0.9, eta=None)
-    gas = gas_of_header(header_in_si(header))[0]
-    np.testing.assert_allclose(gas.value("wall_side"), [0.08, 0.06, 0.04])
-    volume = 2000 * np.pi / 6 * 0.003**3
-    assert float(gas.packing_fraction) == approx(volume / (0.08 * 0.06 * 0.04))
-
-
-def test_speeds_of_drop_tests_are_asked_about(tmp_path):
-    (tmp_path / "drops.csv").write_text("v,eps,eps_err\n10,0.92,0.01\n100,0.9,0.01\n")
-    with pytest.warns(UserWarning, match="v is 100 m/s, and usual is 0 to 8: is it in cm/s"):
-        read_measurement(tmp_path / "drops.csv", gas=GAS)
-
-
 def test_sizes_are_bounded_before_they_are_read(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "MAX_BYTES", 10**6)
     (tmp_path / "large.csv.gz").write_bytes(gzip.compress(bytes(10**7)))
@@ -524,76 +352,3 @@ def test_values_below_zero_need_errors(write):
         columns = (TIMES, factor * below, factor * (0.01 * T + 1e-4))
         measurement = read_measurement(write(text_of(f"t,{name},{name}_err", columns)))
         np.testing.assert_allclose(measurement.curve.temperature, below, rtol=1e-7)
-
-
-@pytest.mark.parametrize(
-    "curve_of",
-    [
-        lambda u: jaxgran.CoolingCurve(1e3 * TIMES * u.ms, 1e4 * T * u.cm**2 / u.s**2),
-        lambda u: jaxgran.CoolingCurve([1e3 * t * u.ms for t in TIMES], T),
-        lambda u: jaxgran.CoolingCurve((1e9 * TIMES).astype("m8[ns]"), T),
-        lambda u: jaxgran.CoolingCurve([timedelta(seconds=t) for t in TIMES], T),
-    ],
-)
-def test_quantities_with_units_are_converted(curve_of):
-    curve = curve_of(pint.UnitRegistry())
-    np.testing.assert_allclose(curve.times, TIMES, rtol=1e-4)
-    np.testing.assert_allclose(curve.temperature, T)
-
-
-def test_a_gas_takes_quantities_with_units():
-    u = pint.UnitRegistry()
-    gas = GAS.replace(diameter=3 * u.mm, packing_fraction=4 * u.percent)
-    assert float(gas.diameter) == approx(0.003) and float(gas.packing_fraction) == approx(0.04)
-    mass = jaxgran.sphere_mass(3 * u.mm, 1.2 * u.g / u.cm**3)
-    assert float(mass) == approx(float(GAS.mass))
-    times = 1e3 * TIMES[:3] * u.ms
-    np.testing.assert_allclose(jaxgran.cool(GAS, times).times, TIMES[:3])
-    with pytest.raises(ValueError, match="expected a quantity in m.2/s.2: Cannot convert"):
-        GAS.replace(temperature=300 * u.K)
-
-
-DATES = np.datetime64("2024-05-01") + (1e3 * TIMES).astype("m8[ms]")
-WRONG_CURVES = [
-    (lambda: jaxgran.CoolingCurve(DATES, T), "got dates, .* dates - dates.0."),
-    (lambda: jaxgran.CoolingCurve(TIMES, T[:5]), "temperature has shape .5,., but times have"),
-    (lambda: jaxgran.CoolingCurve(TIMES, -T), "point 0: T is -0.01.*give T_err"),
-    (lambda: jaxgran.CoolingCurve(TIMES, np.nan * T), "point 0: T is nan"),
-    (lambda: jaxgran.CoolingCurve(TIMES[::-1], T), "times must increase"),
-    (lambda: jaxgran.CoolingCurve(TIMES, T, temperature_error=0.1), "temperature_error has shape"),
-    (
-        lambda: jaxgran.Measurement(GAS, jaxgran.CoolingCurve(TIMES[:, None], T[:, None])),
-        "one axis, got shape .40, 1.; make columns lists, as by x.ravel",
-    ),
-    (lambda: GAS.replace(diameter=jnp.array(True)), "diameter must be a number"),
-    (lambda: GAS.replace(diameter=jnp.array(1j)), "diameter must be a number"),
-]
-
-
-@pytest.mark.parametrize("call, words", WRONG_CURVES)
-def test_curves_are_checked_where_they_are_made(call, words):
-    with pytest.raises(ValueError, match=words):
-        call()
-
-
-def test_only_times_and_temperatures_go_without_a_name():
-    with pytest.raises(TypeError, match="positional"):
-        jaxgran.CoolingCurve(TIMES, T, 0.3 * T)
-
-
-def test_two_copies_are_one_measurement(write):
-    first = read_measurement(write(PLAIN))
-    for other in (PLAIN, IN_MM.replace("t,T,", "t (ms),T (mm^2/s^2),"), text_of("t,T", (TIMES, T))):
-        copies = {"a": first, "b": read_measurement(write(other))}
-        with pytest.raises(ValueError, match="'a' and 'b' hold the same values"):
-            jaxgran.fit(copies)
-
-
-def test_constant_restitution_has_a_key():
-    gas = gas_of(eps=0.9, Y=None, nu=None)
-    assert isinstance(gas.law, jaxgran.ConstantRestitution)
-    assert float(gas.value("coefficient")) == 0.9
-    with pytest.raises(ValueError, match="gives eps, .* and Y, nu of viscoelastic"):
-        gas_of(eps=0.9)
-    with pytest.raises(ValueError, match="lacks nu; .* eps: VALUE"):
-        gas_of(nu=None)
