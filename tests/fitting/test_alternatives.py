@@ -232,3 +232,26 @@ def test_declared_absences_narrow_the_range():
     widths = [np.ptp(np.ravel(result.ranges[A])) for result in (whole, narrow)]
     assert widths[1] < 0.7 * widths[0]
     assert "declare `absent: " in whole.narrowing and narrow.narrowing == ""
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:this curve does not determine")
+def test_no_alternatives_of_a_curve_in_other_units():
+    gas = glass_beads(0.15)
+    curve = synthetic(gas, num_points=8)
+    for factor in (300.0, 1e6):
+        scaled = jaxgran.CoolingCurve(
+            curve.times,
+            factor * curve.temperature,
+            temperature_error=factor * curve.temperature_error,
+        )
+        fit = fitted(gas, scaled, quick=False)
+        assert fit.grade == "not consistent" and not fit.alternatives
+        assert "check the units, the scale of T and T0" in str(fit.reasons)
+
+
+@pytest.mark.filterwarnings("ignore:this curve does not determine")
+def test_a_curve_that_rises_is_not_explained_by_scatter():
+    curve = jaxgran.CoolingCurve([1.0, 2.0, 3.0, 4.0], [0.01, 0.011, 0.012, 0.013])
+    fit = fitted(glass_beads(0.15), curve, quick=True)
+    assert fit.grade == "not consistent" and "T rises from 0.01 to 0.013" in str(fit.reasons)
