@@ -7,8 +7,8 @@ import pytest
 from matplotlib import pyplot
 
 import jaxgran
-from experiments.fit.own_model import HaffLaw
 from tests.beads import SI, glass_beads, hard_gas
+from tests.own_model import HaffLaw
 
 
 def test_a_curve_is_drawn_in_given_axes():

@@ -11,10 +11,10 @@ import optimistix as optx
 import pytest
 
 import jaxgran
-from experiments.fit.own_model import HaffLaw
 from jaxgran import observables
 from jaxgran.extend import ReducedLaw, RestitutionLaw
 from tests.beads import SI, glass_beads, hard_gas, spheres
+from tests.own_model import HaffLaw
 
 NAN, INF = float("nan"), float("inf")
 GAS, GRAINS = glass_beads(0.15), hard_gas(0.9, 0.02, **SI)

@@ -20,14 +20,13 @@ from tests.fitting.curves import (
     deviation,
     fitted,
     in_range,
-    measured,
     synthetic,
 )
 
 
 @pytest.mark.slow
 def test_a_search_that_was_cut_short_is_said_to_be():
-    result = jaxgran.fit(measured("dilute"), max_steps=1)
+    result = jaxgran.fit(jaxgran.example_measurement("dilute"), max_steps=1)
     assert not result.converged and result.ranges == {}
     assert result.grade == "not consistent" and "did not converge" in result.verdict
     assert any("increase max_steps" in reason for reason in result.reasons)
@@ -35,7 +34,7 @@ def test_a_search_that_was_cut_short_is_said_to_be():
 
 @pytest.mark.slow
 def test_dense_measured_curve_is_not_explained():
-    measurement = measured("dense")
+    measurement = jaxgran.example_measurement("dense")
     result = jaxgran.fit(measurement, free=(A,))
     # The known failure of kinetic theory here: 5 to 25 % off.
     assert 0.7 < result.estimate[0] / measurement.gas.value(A) < 0.95
@@ -72,7 +71,7 @@ def test_a_valid_scene_has_no_limitations():
 
 
 def test_every_model_has_limitations_in_a_dense_scene():
-    measurement = measured("dense")
+    measurement = jaxgran.example_measurement("dense")
     gas = measurement.gas
     n = measurement.num_particles
     theory, dsmc, hard, soft = (model.limitations(gas, n) for model in models_of(n))

@@ -4,7 +4,6 @@ import pytest
 
 import jaxgran
 from tests.beads import glass_beads, hard_gas, soft_beads
-from tests.fitting.curves import measured
 
 
 def over(gas, collision_times):
@@ -25,7 +24,7 @@ def errors(choice):
     [("dense", jaxgran.SoftSpheres, 0.76), ("dilute", jaxgran.KineticTheory, 0.987)],
 )
 def test_measured_curves(name, model, fitted):
-    measurement = measured(name)
+    measurement = jaxgran.example_measurement(name)
     gas, curve = measurement.gas, measurement.curve
     a_true = float(dict(measurement.header)["A"])
     options = {"num_particles": measurement.num_particles, "replicas": measurement.replicas}

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import jaxgran
-from experiments.support.scenes import of_lammps
 from jaxgran import HardSpheres
 from jaxgran.extend import Run
 from jaxgran.particles import spheres as moving
@@ -165,7 +164,7 @@ def test_jit_flags_the_start_of_another_gas_and_what_it_cannot_grow():
 
 @pytest.mark.slow
 def test_lammps_curve():
-    measurement = of_lammps("dilute")
+    measurement = jaxgran.example_measurement("dilute")
     gas, curve = measurement.gas, measurement.curve
     ours = jaxgran.cool(gas, curve.times, model=HardSpheres(1000, replicas=4))
     # LAMMPS resolves contacts, whose softness slows the cooling by 0.5 %.

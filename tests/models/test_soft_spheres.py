@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +11,11 @@ import pytest
 from scipy.linalg import hadamard
 
 import jaxgran
-from experiments.support.record import DATA
 from jaxgran import SoftSpheres
 from jaxgran.particles.soft.forces import flight_time
 from tests.beads import curves_of, lattice, soft_beads, spheres, total_energy
+
+DATA = Path(__file__).parents[2] / "experiments" / "data"
 
 
 def last_of_lammps(gas, data, position, velocity):
