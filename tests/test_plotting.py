@@ -54,7 +54,7 @@ def test_a_fit_of_several_measurements_is_not_drawn():
         },
         quick=True,
     )
-    with pytest.raises(ValueError, match="one curve, got one of first, second. Draw each"):
+    with pytest.raises(ValueError, match="got one of first, second. Draw each"):
         jaxgran.plot_fit(several)
     pyplot.close("all")
 

@@ -35,7 +35,7 @@ def test_a_gas_takes_quantities_with_units():
     assert float(mass) == approx(float(GAS.mass))
     times = 1e3 * TIMES[:3] * u.ms
     np.testing.assert_allclose(jaxgran.cool(GAS, times).times, TIMES[:3])
-    with pytest.raises(ValueError, match="expected a quantity in m.2/s.2: Cannot convert"):
+    with pytest.raises(ValueError, match="in m.2/s.2: Cannot convert"):
         GAS.replace(temperature=300 * u.K)
 
 
@@ -44,14 +44,14 @@ DATES = np.datetime64("2024-05-01") + (1e3 * TIMES).astype("m8[ms]")
 
 WRONG_CURVES = [
     (lambda: jaxgran.CoolingCurve(DATES, T), "got dates, .* dates - dates.0."),
-    (lambda: jaxgran.CoolingCurve(TIMES, T[:5]), "temperature has shape .5,., but times have"),
+    (lambda: jaxgran.CoolingCurve(TIMES, T[:5]), "temperature has shape .5,."),
     (lambda: jaxgran.CoolingCurve(TIMES, -T), "point 0: T is -0.01.*give T_err"),
     (lambda: jaxgran.CoolingCurve(TIMES, np.nan * T), "point 0: T is nan"),
     (lambda: jaxgran.CoolingCurve(TIMES[::-1], T), "times must increase"),
     (lambda: jaxgran.CoolingCurve(TIMES, T, temperature_error=0.1), "temperature_error has shape"),
     (
         lambda: jaxgran.Measurement(GAS, jaxgran.CoolingCurve(TIMES[:, None], T[:, None])),
-        "one axis, got shape .40, 1.; make columns lists, as by x.ravel",
+        "got shape .40, 1.; .*x.ravel",
     ),
     (lambda: GAS.replace(diameter=jnp.array(True)), "diameter must be a number"),
     (lambda: GAS.replace(diameter=jnp.array(1j)), "diameter must be a number"),

@@ -28,7 +28,7 @@ def test_measured_curves_are_read():
 
 
 def test_an_unknown_example_is_refused_with_the_known_ones():
-    with pytest.raises(ValueError, match='name must be "dilute" or "dense", got \'granular\''):
+    with pytest.raises(ValueError, match='name .*"dilute" or "dense", got \'granular\''):
         jaxgran.example_measurement("granular")
 
 
@@ -48,7 +48,7 @@ def test_everything_that_was_computed_is_kept(tmp_path):
 
 
 def test_an_archive_of_others_is_refused(tmp_path):
-    words = "not a file that this version of jaxgran.write_curve wrote"
+    words = "jaxgran.write_curve"
     np.savez(tmp_path / "other.npz", a=np.ones(3))
     with pytest.raises(ValueError, match=words):
         jaxgran.read_curve(tmp_path / "other.npz")
@@ -58,7 +58,7 @@ def test_nothing_is_written_over(tmp_path):
     path = tmp_path / "curve.csv"
     path.write_text(HEADER + ROWS)
     curve, header = jaxgran.read_curve(path)
-    with pytest.raises(ValueError, match="exists; choose another name or set overwrite=True"):
+    with pytest.raises(ValueError, match="exists; .* overwrite=True"):
         jaxgran.write_curve(path, curve, {})
     assert path.read_text() == HEADER + ROWS
     jaxgran.write_curve(path, curve, header, overwrite=True)

@@ -52,7 +52,7 @@ def test_a_dataset_has_saved_values(curve, tmp_path):
     assert data["saved_of_replicas.S.1"].dims == ("replica", "time")
     np.testing.assert_array_equal(data["saved.S.0"], each.mean(0))
     np.testing.assert_allclose(data["saved_error.S.1"], 8 / 2)
-    with pytest.raises(ValueError, match="the key 'a.b': keys name arrays"):
+    with pytest.raises(ValueError, match="key 'a.b'"):
         curve.with_saved({"a.b": each}).to_xarray()
     whole = jaxgran.Particles(*(jnp.ones((4, 2, 3, 3)) for _ in range(2)), 2 * jnp.ones(4))
     saved = dataclasses.replace(curve, saved=whole)
@@ -79,7 +79,7 @@ def test_a_table_of_pandas_comes_back(curve):
     table = curve.to_pandas().reset_index().rename(columns={"times": "t", "temperature": "T"})
     named = jaxgran.CoolingCurve.from_pandas(table)
     np.testing.assert_array_equal(named.temperature, curve.temperature)
-    with pytest.raises(ValueError, match="the column speed is not of a curve"):
+    with pytest.raises(ValueError, match="column speed"):
         jaxgran.CoolingCurve.from_pandas(table.rename(columns={"T": "speed"}))
 
 
@@ -94,7 +94,7 @@ def test_every_quantity_of_a_curve_has_a_unit(curve):
 def test_a_batch_of_curves_is_refused(curve):
     two = jax.tree.map(lambda x: jnp.stack([x, x]), curve)
     for show in (two.to_xarray, two.to_pandas):
-        with pytest.raises(ValueError, match="times of this curve have shape"):
+        with pytest.raises(ValueError, match="times .*have shape"):
             show()
 
 

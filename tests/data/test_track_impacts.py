@@ -13,11 +13,11 @@ PLAIN = "\n".join(
 @pytest.mark.parametrize(
     "text, header, message",
     [
-        (f"id,t,x,y,z\n{PLAIN}\n", {}, "the tracks have 2 coordinates of a gas of dimension 3"),
+        (f"id,t,x,y,z\n{PLAIN}\n", {}, "2 coordinates .*dimension 3"),
         ("t,T\n1,2\n", {}, "tracks of particles have id,t,x,y"),
-        (f"id,t,x,y,z\n{PLAIN}\n", {"aspect_ratio": 10}, "rods and ellipsoids collide at another"),
-        (f"id,t,x,y,z\n{PLAIN}\n", {"dimension": 2}, "show no impact with 3 frames before and"),
-        ("id,t,x,y\n1,0,0,0\n1,1,0,0\n", {"dimension": 2}, "have 2 frames; impacts need 3 before"),
+        (f"id,t,x,y,z\n{PLAIN}\n", {"aspect_ratio": 10}, "rods and ellipsoids"),
+        (f"id,t,x,y,z\n{PLAIN}\n", {"dimension": 2}, "no impact with 3 frames"),
+        ("id,t,x,y\n1,0,0,0\n1,1,0,0\n", {"dimension": 2}, "2 frames; .* 3 before"),
     ],
 )
 def test_tracks_that_cannot_show_impacts_are_refused(tmp_path, text, header, message):

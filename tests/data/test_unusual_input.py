@@ -70,14 +70,14 @@ READ = {
 """Files that are read as the plain one, without a question."""
 
 REFUSED = {
-    "the file is empty; it needs the columns": "",
-    "not a text file but a binary one; give a CSV": b"\x89PNG\r\n\x1a\n\x00\x00\xff\xfe",
+    "the file is empty": "",
+    "binary.*; give a CSV": b"\x89PNG\r\n\x1a\n\x00\x00\xff\xfe",
     "not a text file but a binary one": PLAIN.encode("utf-16-le"),
     "between commas, got .*semicolon": with_decimal_comma(PLAIN),
     "line 12: '1,000' has a comma.*thousands": text_of(row='"1,000",0.01,0.001'),
     "'0,02' has a comma, and '0.019": SEMICOLONS.replace("0.02;", "0,02;"),
     "line 8: numbers without names": PLAIN.replace("t,T,T_err\n", ""),
-    "line 8: the file ends without columns; it needs t,T": HEAD,
+    "line 8: .*without columns; .*t,T": HEAD,
     "line 12: expected 3 finite numbers": text_of(row="0.1,,0.0002"),
     "line 12: expected 3 .* between commas": text_of(row="0.1,0.01,0.0002,5"),
     "line 10: expected 2 finite numbers .* got '1,x'": f"{HEAD}t,T\n0,1\n1,x\n2,.1\n3,.05\n",
@@ -89,27 +89,27 @@ REFUSED = {
     "missing: T; not known: speed; .* there may be vx2, v2_xy, v2, energy": "t,speed\n1,2\n",
     "missing: T; not known: vx2_err": "t,vx2_err\n1,2\n",
     "each once": "t,T,T\n1,2,3\n",
-    "T and vx2 each give the temperature; keep one": "t,T,vx2\n1,2,3\n",
-    "column energy needs the mass of a particle: add diameter and density": ENERGY,
-    "column T: 'K' is not known as a unit of m.2/s.2": PLAIN.replace("T,", "T (K),"),
-    "column t: 'px' is not known as a unit of s": PLAIN.replace("t,T", "t (px),T"),
-    "length_unit: 's' is not known as a unit of m; write a unit": f"# length_unit: s\n{PLAIN}",
-    "header line N: 'many' is not a finite number": text_of(N="many"),
-    "header line replicas: must be a whole number": text_of(N=10, replicas=1.5),
+    "T and vx2 .*; keep one": "t,T,vx2\n1,2,3\n",
+    "column energy .*add diameter and density": ENERGY,
+    "column T: 'K' .*m.2/s.2": PLAIN.replace("T,", "T (K),"),
+    "column t: 'px' .*unit of s": PLAIN.replace("t,T", "t (px),T"),
+    "length_unit: 's' .*unit of m; write a unit": f"# length_unit: s\n{PLAIN}",
+    "header line N: 'many'": text_of(N="many"),
+    "header line replicas: .*whole number": text_of(N=10, replicas=1.5),
     # Values.
-    "line 4: t is 1 after 1; times must increase: sort the rows": "t,T\n0,1\n1,.5\n1,.3\n",
-    "line 2: t is -1, it must be a positive number": "t,T\n-1,1\n2,.5\n3,.3\n",
+    "line 4: t is 1 after 1; .*sort the rows": "t,T\n0,1\n1,.5\n1,.3\n",
+    "line 2: t is -1, .*positive": "t,T\n-1,1\n2,.5\n3,.3\n",
     "line 1 begins with '!'.* begin with # or %": PLAIN.replace("# ", "! "),
-    "write errors into a column of their own": text_of(row="0.04,0.019 ± 0.001,1e-4"),
+    "errors into a column": text_of(row="0.04,0.019 ± 0.001,1e-4"),
     "eta: '0.04.* gives eta_err again": text_of(eta="0.04 ± 0.01", eta_err="0.02"),
     "header line eta: '_0e-2' is not known": text_of(eta="1_0e-2"),
-    "'m..9..9..9' is not known as a unit of m": text_of(diameter="2 m**9**9**9"),
+    "'m..9..9..9' .*unit of m": text_of(diameter="2 m**9**9**9"),
     "field larger than field limit": text_of(row="x" * 200_000),
-    "line 3: T is 0, it must be a positive number": "t,T\n0,1\n1,0\n2,.3\n",
+    "line 3: T is 0, .*positive": "t,T\n0,1\n1,0\n2,.3\n",
     "line 3: T_err is 0": "t,T,T_err\n0,1,0\n1,.5,0\n2,.3,.1\n",
     "line 3: msd is -1": "t,T,msd\n0,1,0\n1,.5,-1\n2,.3,.1\n",
-    "line 3: mean_speed is -1, it must be a positive number": "t,mean_speed\n0,1\n1,-1\n2,1\n",
-    "a curve needs at least 3 points, got 2": "t,T\n0,1\n1,.5\n",
+    "line 3: mean_speed is -1, .*positive": "t,mean_speed\n0,1\n1,-1\n2,1\n",
+    "at least 3 points, got 2": "t,T\n0,1\n1,.5\n",
 }
 """What is said of a file that is refused, and the file."""
 
@@ -229,8 +229,8 @@ def test_drop_tests_are_read_like_curves(tmp_path):
     above = drops_of("v,eps,eps_err\n0.02,1.01,0.02\n0.1,0.92,0.01\n")
     assert np.max(above.restitution) == 1.01  # within its error
     for text, message in (
-        ("v,eps,eps_err\n0.02,1.2,0.02\n", "at most 1 within its error, got 1.2 .- 0.02"),
-        ("v,eps\n1,2\n", "line 1: the columns are v, eps; a drop test needs v,eps,eps_err"),
+        ("v,eps,eps_err\n0.02,1.2,0.02\n", "at most 1 .*got 1.2 .- 0.02"),
+        ("v,eps\n1,2\n", "line 1: .*v, eps; .*v,eps,eps_err"),
         ("v,eps,eps_err\n0.1,0.9\n", "line 2: expected 3 finite numbers .*, got '0.1,0.9'"),
         ("v,eps,eps_err\n", "at least one impact"),
         ("v,eps,eps_err\n0.1,0.9,0\n", "error must lie in"),
@@ -241,24 +241,24 @@ def test_drop_tests_are_read_like_curves(tmp_path):
 
 NO_COUNTS = ("0", "-5", "3.5", "many", "inf", "nan")
 CALLS = [
-    (lambda: read_curve(None), "path must be the name of a file, got None"),
-    (lambda: read_curve("none.csv"), "no such file; check the path"),
+    (lambda: read_curve(None), "path must .*got None"),
+    (lambda: read_curve("none.csv"), "no such file"),
     (lambda: read_curve("."), "not a text file"),
-    (lambda: read_measurement(None), "path must be the name of a file, got None"),
-    (lambda: read_measurement("a.csv", 3), "header must be a dictionary of texts and numbers"),
-    (lambda: read_measurement("a.csv", {"eta": None}), "header must be a dictionary of texts"),
+    (lambda: read_measurement(None), "path must .*got None"),
+    (lambda: read_measurement("a.csv", 3), "header must be a dictionary"),
+    (lambda: read_measurement("a.csv", {"eta": None}), "header must be a dictionary"),
     (lambda: gas_of(Y=None, T0=None), "the header lacks Y, T0"),
-    (lambda: gas_of(Y="soft"), "header line Y: 'soft' is not a finite number"),
-    (lambda: gas_of(Y="guess"), "header line Y: 'guess' is not a finite number"),
+    (lambda: gas_of(Y="soft"), "header line Y: 'soft'"),
+    (lambda: gas_of(Y="guess"), "header line Y: 'guess'"),
     (lambda: gas_of(Y=-1), "youngs_modulus must lie in"),
     (lambda: gas_of(eta=0.9), "packing_fraction must lie in"),
     (lambda: gas_of(dimension=4), "dimension must be 2 or 3"),
-    (lambda: gas_of(dimension=2.9), "dimension: must be a whole number from 1 to 1e.12, got '2.9'"),
+    (lambda: gas_of(dimension=2.9), "dimension: .*got '2.9'"),
     (lambda: gas_of(reduced_inertia=0.4), "reduced_inertia without beta_t.*# beta_t: guess"),
     # elements, and what no gas here has
-    (lambda: gas_of(T_rot_0=1), "gives T_rot_0 without beta_t"),
-    (lambda: gas_of(container_side=0.05), "gives container_side without wall_restitution"),
-    (lambda: gas_of(friction=0.5), "gives friction without tangential_damping"),
+    (lambda: gas_of(T_rot_0=1), "T_rot_0 without beta_t"),
+    (lambda: gas_of(container_side=0.05), "container_side without wall_restitution"),
+    (lambda: gas_of(friction=0.5), "friction without tangential_damping"),
     (
         lambda: gas_of(friction=0.3, tangential_damping=0.5, beta_t=0),
         "both beta_t .* and tangential_damping.*SoftSpheres",
@@ -272,11 +272,11 @@ CALLS = [
     (lambda: gas_of(charge=1e-12), "charge: .*deflected without touching"),
     (
         lambda: gas_of(wall_restitution=0.9, container_side=0.07),
-        "N, eta and container_side contradict.*eta = 0.0824",
+        "N, eta and container_side.*eta = 0.0824",
     ),
     # other headers and files
-    (lambda: priors_of_header({"eta_err": "0.01"}), "gives eta_err without eta"),
-    (lambda: priors_of_header({"eta": "1", "eta_err": "-1"}), "eta_err: must be a positive number"),
+    (lambda: priors_of_header({"eta_err": "0.01"}), "eta_err without eta"),
+    (lambda: priors_of_header({"eta": "1", "eta_err": "-1"}), "eta_err: .*positive"),
     (lambda: priors_of_header({"eta": "0.05", "eta_err": "some"}), "not a finite number"),
     (
         lambda: priors_of_header({"diameter": "1", "diameter_err": "1"}),
@@ -284,16 +284,16 @@ CALLS = [
     ),
     (lambda: write_curve("a.csv", CURVE, None), "header must be a dictionary"),
     (lambda: write_curve("a.csv", None, {}), "curve must be a jaxgran.CoolingCurve"),
-    (lambda: write_curve("a.csv", CURVE, {"n": "a\n#A: 9"}), "'n': key and value must be one line"),
+    (lambda: write_curve("a.csv", CURVE, {"n": "a\n#A: 9"}), "'n': .*one line"),
     (lambda: write_curve("a.csv", CURVE, {"a: eta": "9"}), "without : and ="),
     (lambda: write_curve("a.csv", CURVE, {}, overwrite=1), "overwrite must be True"),
     (lambda: jaxgran.CoolingCurve(TIMES, np.ma.masked_less(T, 0.01)), "masked"),
     (lambda: read_measurement("none.csv"), "no such file"),
     (lambda: jaxgran.DropTest([0.1, 0.2], [0.9], [0.01]), "lists of equal length"),
-    (lambda: absent_of_header({"absent": "gravity"}), "'gravity' is not known; give some"),
+    (lambda: absent_of_header({"absent": "gravity"}), "'gravity' .*; give"),
     (
         lambda: absent_of_header({"absent": "walls", "container_side": "1"}),
-        "declares walls absent and gives container_side",
+        "walls absent .*container_side",
     ),
     *((lambda n=n: gas_of(dimension=n), "header line dimension") for n in NO_COUNTS),
 ]
@@ -308,7 +308,7 @@ def test_calls_that_are_wrong_say_what_is_wanted(call, words):
 def test_sizes_are_bounded_before_they_are_read(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "MAX_BYTES", 10**6)
     (tmp_path / "large.csv.gz").write_bytes(gzip.compress(bytes(10**7)))
-    with pytest.raises(ValueError, match="it has more than 1e.06 bytes"):
+    with pytest.raises(ValueError, match="more than 1e.06 bytes"):
         read_curve(tmp_path / "large.csv.gz")
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(
@@ -316,7 +316,7 @@ def test_sizes_are_bounded_before_they_are_read(tmp_path, monkeypatch):
     )
     with zipfile.ZipFile(tmp_path / "large.npz", "w") as archive:
         archive.writestr("times.npy", header.getvalue())
-    with pytest.raises(ValueError, match="times.npy is shorter than its header says"):
+    with pytest.raises(ValueError, match="times.npy is shorter"):
         read_curve(tmp_path / "large.npz")
 
 
@@ -340,13 +340,13 @@ def test_tables_of_energies_are_curves(write):
 
 
 def test_a_curve_is_written_as_what_its_name_says():
-    with pytest.raises(ValueError, match="c.foo: a curve is written as .npz or as text, .csv"):
+    with pytest.raises(ValueError, match="c.foo: .*.npz .*.csv"):
         write_curve("c.foo", CURVE, {})
 
 
 def test_values_below_zero_need_errors(write):
     below = np.where(TIMES > 30, -T, T)
-    with pytest.raises(ValueError, match="line .*if noise was subtracted, give T_err"):
+    with pytest.raises(ValueError, match="line .*give T_err"):
         read_measurement(write(text_of("t,T", (TIMES, below))))
     for name, factor in (("T", 1.0), ("v2", 3.0)):
         columns = (TIMES, factor * below, factor * (0.01 * T + 1e-4))

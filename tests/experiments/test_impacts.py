@@ -78,7 +78,7 @@ def test_impacts_on_walls_are_found_where_there_are_walls(tmp_path):
     assert walls.onto == "wall" and len(walls.speed) > 50
     result = jaxgran.fit(tests["wall impacts"], free="wall_restitution")
     assert abs(result.estimate[0] - 0.8) < 3 * result.standard_error[0] < 0.03
-    with pytest.raises(ValueError, match="impacts on walls need walls parallel to the coordin"):
+    with pytest.raises(ValueError, match="walls parallel to the coordin"):
         jaxgran.read_impacts(
             tmp_path / "tracks.csv", {"container_side": 1.2 * SIDE, "N": 250, "eta": 0.0174}
         )

@@ -93,5 +93,5 @@ def test_two_copies_are_one_measurement(write):
     first = read_measurement(write(PLAIN))
     for other in (PLAIN, IN_MM.replace("t,T,", "t (ms),T (mm^2/s^2),"), text_of("t,T", (TIMES, T))):
         copies = {"a": first, "b": read_measurement(write(other))}
-        with pytest.raises(ValueError, match="'a' and 'b' hold the same values"):
+        with pytest.raises(ValueError, match="'a' and 'b' .*same values"):
             jaxgran.fit(copies)

@@ -47,7 +47,7 @@ def test_values_below_zero_are_fitted():
         lambda x: jaxgran.log_likelihood(gas.replace(dissipative_constant=x), measurement)
     )(jnp.asarray(value))
     assert abs(slope * error) < 0.1  # both are the same likelihood
-    with pytest.raises(ValueError, match="T below 0 is compared by kinetic theory only"):
+    with pytest.raises(ValueError, match="T below 0 .*kinetic theory"):
         fitted(GAS, curve, model=jaxgran.DSMC(50, replicas=2))
 
 

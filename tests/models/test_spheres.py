@@ -159,7 +159,7 @@ def two_spheres(gas, distance, speed):
 def test_soft_spheres_that_start_overlapping_are_told():
     gas = glass_beads(0.3, packing_fraction=0.02)
     SoftSpheres(2, start=two_spheres(gas, 1.01, 0.1)).check(gas)
-    with pytest.warns(UserWarning, match="overlap: the energy of their contacts, .* J, becomes"):
+    with pytest.warns(UserWarning, match="overlap: .* J"):
         SoftSpheres(2, start=two_spheres(gas, 0.95, 0.1)).check(gas)
 
 

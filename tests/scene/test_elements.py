@@ -135,7 +135,7 @@ def test_a_viscoelastic_wall_is_softer_by_the_root_of_two():
 
 def test_a_box_that_does_not_hold_other_spheres_is_refused_in_a_choice():
     fits = gas_of(**ROUGH)
-    with pytest.raises(ValueError, match="100 spheres of packing_fraction 0.04 need a container"):
+    with pytest.raises(ValueError, match="100 spheres .*0.04.* container"):
         jaxgran.choose_model(fits, [1.0], num_particles=100)
 
 
