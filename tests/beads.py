@@ -5,21 +5,36 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxgran
-from experiments.support import scenes
 
 SI = {"diameter": 2e-3, "mass": 1e-5, "temperature": 0.01}
 
 
+def beads(packing_fraction, beta, contact_fraction=None, dimension=3) -> jaxgran.Gas:
+    """Beads of 2 mm with Y = 1e7 Pa, or that of a contact duration over mean free time."""
+    gas = jaxgran.Gas(
+        jaxgran.Viscoelastic(1e7, 0.22, 1e-6),
+        diameter=2e-3,
+        mass=jaxgran.sphere_mass(2e-3, 2500.0),
+        packing_fraction=packing_fraction,
+        temperature=0.01,
+        dimension=dimension,
+    )
+    if contact_fraction is not None:
+        stiffer = (float(gas.contact_fraction) / contact_fraction) ** 2.5
+        gas = gas.replace(youngs_modulus=stiffer * gas.value("youngs_modulus"))
+    return gas.replace(dissipative_constant=1e-6 * beta / float(gas.thermal_beta))
+
+
 def glass_beads(beta: float = 0.15, dimension: int = 3, **values) -> jaxgran.Gas:
     """A gas of 2 mm beads whose impacts at the thermal speed have a given beta."""
-    gas = scenes.beads(0.05, beta, dimension=dimension)
+    gas = beads(0.05, beta, dimension=dimension)
     gas = gas.replace(youngs_modulus=5e7, dissipative_constant=1e-6)
     return gas.replace(dissipative_constant=1e-6 * beta / gas.thermal_beta).replace(**values)
 
 
 def soft_beads(fraction=0.02, beta=0.15, dimension=3, packing_fraction=0.05) -> jaxgran.Gas:
     """Glass beads whose contacts last a given part of the mean free time."""
-    return scenes.beads(packing_fraction, beta, fraction, dimension)
+    return beads(packing_fraction, beta, fraction, dimension)
 
 
 def hard_gas(law=0.9, packing_fraction=0.05, dimension=3, **values) -> jaxgran.Gas:

@@ -33,12 +33,11 @@ import numpy as np
 import pytest
 
 import jaxgran
-from experiments.fit.own_model import HaffLaw
-from experiments.support.scenes import hard_beads
 from jaxgran import Rough, StokesDrag, Walls, WhiteNoise
 from jaxgran.data.curve import QUANTITIES
 from jaxgran.scene.parameters import PARAMETER_UNITS
-from tests.beads import assert_same, glass_beads, lattice, total_energy
+from tests.beads import assert_same, beads, glass_beads, lattice, total_energy
+from tests.own_model import HaffLaw
 
 N, REPLICAS = 64, 2
 TAUS = np.array([0.0, 0.02, 0.5, 2.0])
@@ -118,9 +117,10 @@ class Case:
         return self.curve_and_slope()
 
 
+CONSTANT = dataclasses.replace(beads(0.2, 0.1), law=jaxgran.ConstantRestitution(0.9))
 CASES = {
     "kinetic theory": Case(jaxgran.KineticTheory(), ALL),
-    "own model": Case(HaffLaw(), (), hard_beads(0.2, 0.9), "coefficient", 1.0),
+    "own model": Case(HaffLaw(), (), CONSTANT, "coefficient", 1.0),
     "DSMC": Case(jaxgran.DSMC(N, replicas=REPLICAS), ALL),
     "hard spheres": Case(jaxgran.HardSpheres(N, replicas=REPLICAS), ALL),
     "soft spheres": Case(jaxgran.SoftSpheres(N, replicas=REPLICAS), OF_SOFT_SPHERES),
@@ -482,7 +482,7 @@ class TestContract:
         program = jax.jit(lambda x: jax.pure_callback(np.sin, x, x)).lower(1.0)
         assert HOST.search(program.as_text()) is not None
 
-    @of_models(lambda case: not isinstance(case.model, jaxgran.KineticTheory))  # see test_gradients
+    @of_models(lambda case: not isinstance(case.model, jaxgran.KineticTheory))  # see test_solver
     def test_reverse_is_forward(self, case):
         weights = jnp.arange(1.0, 5.0)
 

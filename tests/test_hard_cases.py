@@ -13,10 +13,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jaxgran
-from experiments.support.closed_forms import haff
-from experiments.support.scenes import beads, cool
 from jaxgran import DSMC, HardSpheres, SoftSpheres
-from tests.beads import hard_gas, spheres, without
+from tests.beads import beads, hard_gas, spheres, without
+from tests.own_model import haff
 
 FREE = "dissipative_constant"
 THEORY = jaxgran.KineticTheory(corrections=without("softness", "correlations"), order=2)
@@ -31,6 +30,11 @@ def worst(found, exact):
 def either(double, single):
     """Return the number of the precision in use."""
     return double if jnp.result_type(float) == jnp.float64 else single
+
+
+def cool(gas, times, model=None, **options):
+    key = jax.random.key(0)
+    return jaxgran.cool(gas, times, model=model, key=key, progress=False, **options)
 
 
 def taus(gas, *tau):

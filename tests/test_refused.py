@@ -11,10 +11,10 @@ import optimistix as optx
 import pytest
 
 import jaxgran
-from experiments.fit.own_model import HaffLaw
 from jaxgran import observables
 from jaxgran.extend import ReducedLaw, RestitutionLaw
 from tests.beads import SI, glass_beads, hard_gas, spheres
+from tests.own_model import HaffLaw
 
 NAN, INF = float("nan"), float("inf")
 GAS, GRAINS = glass_beads(0.15), hard_gas(0.9, 0.02, **SI)
@@ -161,7 +161,7 @@ SCENES = [
     (lambda: jaxgran.RestitutionSeries([INF], [0.2]), "got inf"),
     (lambda: Open(2.0), r"coefficient must lie in \(0, 1\), got 2"),
     # rough spheres, drag and walls
-    (lambda: jaxgran.Rough(1.1), r"tangential_restitution must lie in \[-1, 1\], got 1.1"),
+    (lambda: jaxgran.Rough(1.1), r"tangential_restitution .*\[-1, 1\], got 1.1"),
     (lambda: jaxgran.Rough(0.0, inertia=0.0), r"inertia must lie in \(0, 1\]"),
     (lambda: jaxgran.Rough(0.0, rotational_temperature=-1.0), "rotational_temperature"),
     (lambda: jaxgran.Rough(0.5, friction=-0.1), "friction must lie in"),
@@ -182,15 +182,15 @@ SCENES = [
     (lambda: between_walls(friction=0.4, tangential_damping=0.8), "walls needs frictional spheres"),
     (
         lambda: gas_with(drag=jaxgran.StokesDrag(0.1, rotational_rate=0.2)),
-        "rotational_rate of the drag needs spheres that rotate, got a rate of 0.2",
+        "rotational_rate .*rotate, .*0.2",
     ),
-    (lambda: gas_with(surface=0.5), "expected a jaxgran.Rough, a jaxgran.Frictional or"),
-    (lambda: gas_with(drag=0.5), "expected a jaxgran.StokesDrag or None, got 0.5"),
+    (lambda: gas_with(surface=0.5), "jaxgran.Rough, .*jaxgran.Frictional"),
+    (lambda: gas_with(drag=0.5), "jaxgran.StokesDrag .*got 0.5"),
     # drives
     (lambda: jaxgran.WhiteNoise(-1.0), "strength of the drive"),
     (lambda: gas_with(drive=1.0), r"expected a jaxgran\.WhiteNoise"),
-    (lambda: steady_state(1.0, 0.01), "losses balance the drive at no temperature"),
-    (lambda: steady_state(0.9, 0.0), "balance the drive at no"),
+    (lambda: steady_state(1.0, 0.01), "the drive at no temperature"),
+    (lambda: steady_state(0.9, 0.0), "the drive at no"),
     (lambda: jaxgran.steady_state(GRAINS), "add drive=WhiteNoise"),
     # At T_0 they overlap by .4 %, in the steady state by more than theory can correct.
     (lambda: cool(HOT), "T_0, to which the gas heats up.*SoftSpheres"),
@@ -201,7 +201,7 @@ SCENES = [
     ),
     # settings of models
     (lambda: jaxgran.KineticTheory(order=4), "order must be 2 or 3, got 4"),
-    (lambda: jaxgran.DSMC(1), "num_particles must be a whole number >= 2, an int"),
+    (lambda: jaxgran.DSMC(1), "num_particles .*>= 2"),
     (lambda: jaxgran.DSMC(10, step=0.2), r"step must lie in \(0, 0.1\], got 0.2"),
     (lambda: jaxgran.DSMC(10, replicas=0), "replicas must be a whole number >= 1"),
     (lambda: jaxgran.HardSpheres(10.0), "num_particles must be a whole number >= 2"),
@@ -225,9 +225,9 @@ SCENES = [
         (partial(jaxgran.extend.Domain().check, "share", x), "share must lie in")
         for x in (NAN, INF, -INF)
     ),
-    (lambda: jaxgran.CoolingCurve(["steel"], [1.0]), "expected a number or an array of numbers"),
-    (lambda: jaxgran.CoolingCurve([object()], [1.0]), "expected a number or an array of numbers"),
-    (lambda: jaxgran.CoolingCurve([1.0, [2.0]], [1.0]), "expected a number or an array of numbers"),
+    (lambda: jaxgran.CoolingCurve(["steel"], [1.0]), "a number or an array"),
+    (lambda: jaxgran.CoolingCurve([object()], [1.0]), "a number or an array"),
+    (lambda: jaxgran.CoolingCurve([1.0, [2.0]], [1.0]), "a number or an array"),
 ]
 CALLS = [
     (lambda: cool(GAS.replace(mass=[1.0, 2.0])), "mass .* shape .2,.*vmap"),
@@ -236,7 +236,7 @@ CALLS = [
     (lambda: cool(model=3), "model must be a jaxgran model, got 3"),
     (
         lambda: cool(GAS.replace(diameter=1e-300), model=jaxgran.HardSpheres(20)),
-        "diameter 1e-300 m is so small that the volume of a sphere is 0",
+        "diameter 1e-300 m .*small",
     ),
     (lambda: cool(model=SOFT, key=5), "jax.random.key.5., got 5"),
     (lambda: cool(model=SOFT, checkpoint=5), "checkpoint must be a path"),
@@ -249,42 +249,42 @@ CALLS = [
     # measurements
     (
         lambda: measured(None),
-        "data must be a jaxgran.CoolingCurve or a jaxgran.DropTest, got NoneType",
+        "data .*CoolingCurve .*DropTest, got NoneType",
     ),
-    (lambda: measured((TIMES, T)), "Make a curve of arrays by jaxgran.CoolingCurve.t, T."),
-    (lambda: measured(gas=None), "gas must be a jaxgran.Gas, got None"),
-    (lambda: measured(num_particles=-5), "num_particles must be a whole number >= 1, an int, got"),
-    (lambda: measured(replicas=0), "replicas must be a whole number >= 1, an int, got 0"),
-    (lambda: measured(num_particles=10, tracked=20), "tracked must be at most N = 10, got 20"),
+    (lambda: measured((TIMES, T)), "by jaxgran.CoolingCurve.t, T."),
+    (lambda: measured(gas=None), "jaxgran.Gas, got None"),
+    (lambda: measured(num_particles=-5), "num_particles .*>= 1, .*got -5"),
+    (lambda: measured(replicas=0), "replicas .*>= 1, .*got 0"),
+    (lambda: measured(num_particles=10, tracked=20), "tracked .*N = 10, got 20"),
     (lambda: measured(calibration_error=-0.1), "calibration_error must lie in"),
-    (lambda: measured(errors_measured="no"), "errors_measured must be True or False"),
-    (lambda: measured(absent=("gravity",)), "absent must be a tuple of walls, roughness, drag"),
-    (lambda: measured(absent="walls"), "absent must be a tuple of walls, roughness, drag"),
-    (lambda: measured(absent=5), "absent must be a tuple of walls, roughness, drag.*got 5"),
+    (lambda: measured(errors_measured="no"), "errors_measured must be True"),
+    (lambda: measured(absent=("gravity",)), "absent .*walls, roughness, drag"),
+    (lambda: measured(absent="walls"), "absent .*walls, roughness, drag"),
+    (lambda: measured(absent=5), "absent .*walls, roughness, drag.*got 5"),
     (lambda: measured(rounding={"temperature": [1e-6, 1e-6]}), "one for each time, got shape .2,"),
-    (lambda: measured(guesses=("beta",)), "guesses must be a tuple of .*got .'beta'"),
+    (lambda: measured(guesses=("beta",)), "guesses .*got .'beta'"),
     (lambda: measured(NO_VALUES), "displacement_error without the values"),
-    (lambda: measured(priors=[(PHI, 0.05, 0.01)]), "priors must be a dictionary of names"),
+    (lambda: measured(priors=[(PHI, 0.05, 0.01)]), "priors must be a dictionary"),
     (
         lambda: measured(priors={"phi": (0.05, 0.01)}),
         "Gas has no parameter 'phi'; it has .*, and density",
     ),
     (lambda: measured(priors={PHI: 0.05}), r"packing_fraction needs \(value, standard error\)"),
     (lambda: measured(priors={PHI: (0.05, -0.01)}), "error of packing_fraction must lie in"),
-    (lambda: measured(priors={PHI: (0.05, 0.0)}), "Leave out values that are known exactly"),
+    (lambda: measured(priors={PHI: (0.05, 0.0)}), "Leave out values"),
     (lambda: measured(priors={PHI: (1.5, 0.1)}), "priors: packing_fraction must lie in"),
     (lambda: measured(priors={A: (0.0, 1e-7)}), "lies on the end of its range"),
     (lambda: measured(DROPS).curve, "a drop test, without a curve"),
-    (lambda: fit(CURVE), "got a CoolingCurve. Make one by jaxgran.read_measurement"),
-    (lambda: fit((TIMES, T)), "got a tuple. Make one by jaxgran.read_measurement"),
+    (lambda: fit(CURVE), "got a CoolingCurve. .*jaxgran.read_measurement"),
+    (lambda: fit((TIMES, T)), "got a tuple. .*jaxgran.read_measurement"),
     (lambda: fit({}), "no measurement is given"),
-    (lambda: fit({"a": measured(), "b": CURVE}), "'b' must be a jaxgran.Measurement, got a Cool"),
-    (lambda: fit({"a: b": measured()}), "labels of measurements are texts without"),
+    (lambda: fit({"a": measured(), "b": CURVE}), "'b' .*jaxgran.Measurement, got a Cool"),
+    (lambda: fit({"a: b": measured()}), "labels of measurements .*without"),
     (lambda: SOFT.sized_for(GAS, spare=-1), "spare must lie in"),
     (lambda: cool(model=jaxgran.SoftSpheres(20, start=(1, 2))), "Particles"),
     (
         lambda: cool(OF_TWO, model=jaxgran.HardSpheres(2, start=TOUCHING)),
-        "0.5 diameters apart, hard spheres must not overlap",
+        "0.5 diameters apart.*overlap",
     ),
     (lambda: cool(OF_TWO, model=jaxgran.HardSpheres(3, start=APART)), "start.position has shape"),
     (lambda: cool(hard_gas(0.8, 0.09), model=jaxgran.HardSpheres(2, start=APART)), "start.box_s"),
@@ -304,7 +304,7 @@ CALLS = [
     (lambda: jaxgran.Viscoelastic("5e7", 0.2, 1e-6), "got '5e7'"),
     (lambda: GAS.replace(mass=True), "mass must be a number"),
     *(
-        (partial(jaxgran.KineticTheory, x), "corrections must be a collection of some of")
+        (partial(jaxgran.KineticTheory, x), "corrections must be")
         for x in ("sonine", ["sonine", "heat"], False, [[]])
     ),
     (lambda: jaxgran.DSMC(50, replicas=True), "whole number >= 1"),
@@ -322,11 +322,11 @@ CALLS = [
     (lambda: cool(throw="no"), "throw must be True or"),
     (lambda: jaxgran.cool(GAS, [0.1], progress=5), "must be True"),
     (lambda: jaxgran.DropTest(np.ma.masked_all(1), [0.9], [0.01]), "are masked"),
-    (lambda: jaxgran.read_particles(None), "must be the name of a file, got None"),
+    (lambda: jaxgran.read_particles(None), "name of a file, got None"),
     (lambda: jaxgran.read_curve("a.csv", [1]), "must be a dictionary"),
     (lambda: jaxgran.read_particles("a.gsd", dimension=4), "must be 2 or 3"),
     (lambda: cool(model=DSMC, trajectory="a.gsd"), "DSMC has no positions"),
-    (lambda: cool(model=SOFT, trajectory="a.dcd"), "ends in .gsd or .xyz, got 'a.dcd'"),
+    (lambda: cool(model=SOFT, trajectory="a.dcd"), ".gsd or .xyz, got 'a.dcd'"),
     (lambda: cool(model=SOFT, trajectory=3), "must be a path, got 3"),
     (lambda: hard_gas(NotReduced()), "must return a .*ReducedLaw"),
     (lambda: cool(checkpoint="run.ckpt"), "no run to be saved"),
@@ -351,7 +351,7 @@ CALLS = [
         "got .1, 10, 3.: take particles.position.0",
     ),
     (partial(observables.structure_factor, POINTS, 1.0, 0), "num_shells must be a whole number"),
-    (partial(observables.cell_density, POINTS, 1.0, 0), "cells must be a whole number >= 1, got 0"),
+    (partial(observables.cell_density, POINTS, 1.0, 0), "cells .*>= 1, got 0"),
     (partial(observables.velocity_distribution, POINTS, [0.1]), "at least two increasing numbers"),
     # the choice of a model
     *((partial(choose, x), "tolerance must") for x in (0, -0.1, NAN, "2 %")),
@@ -361,7 +361,7 @@ CALLS = [
     (lambda: fit(model="auto"), "must be a jaxgran model, got .auto"),
     (
         lambda: jaxgran.log_likelihood(GAS, measured(), model=jaxgran.DSMC(10)),
-        "needs a model without noise, got DSMC",
+        "without noise, got DSMC",
     ),
     (lambda: jaxgran.log_likelihood(GAS, CURVE), "measurement must be a jaxgran.Measurement"),
     (lambda: jaxgran.log_likelihood(GAS, measured(DROPS)), "a drop test, without a curve"),
@@ -384,21 +384,21 @@ FITS = [
     ({"free": (T_0, T_0)}, "different names"),
     (
         {"free": "law", "measurement": measured(gas=FIXED)},
-        'free="law", but the law Fixed has no parameters',
+        'free="law", .*Fixed has no parameters',
     ),
-    ({"solver": "simplex"}, "solver must be a gradient transformation of optax"),
+    ({"solver": "simplex"}, "solver must be .*optax"),
     (HAFF | {"measurement": measured(gas=GRAINS), "solver": optax.lbfgs()}, "line search"),
-    ({"max_steps": 0}, "max_steps must be a whole number >= 1, an int, got 0"),
+    ({"max_steps": 0}, "max_steps .*>= 1, .*got 0"),
     ({"quick": 1}, "quick must be True or False"),
     (
         {"measurement": measured(FEW), "free": (A, T_0, PHI)},
-        "3 points .* cannot determine 3 parameters; free fewer",
+        "3 points .*3 parameters; free fewer",
     ),
     # t0
-    ({"free": (A, "t0"), "model": DSMC}, "t0 is fitted through kinetic theory only"),
+    ({"free": (A, "t0"), "model": DSMC}, "t0 .*kinetic theory only"),
     (
         {"measurement": measured(priors={"t0": (0.0, 1.0)}), "model": DSMC},
-        "t0 is fitted through kinetic theory only",
+        "t0 .*kinetic theory only",
     ),
     (
         {"measurement": {"a": measured(), "b": measured(LATER)}, "free": (A, "t0")},
@@ -412,7 +412,7 @@ FITS = [
     ({"model": jaxgran.SoftSpheres(100)}, "replicas >= 2"),
     ({"model": jaxgran.SoftSpheres(100, replicas=2, projection=None)}, "projection"),
     ({"model": SPHERES, "solver": optx.BFGS(1e-8, 1e-8)}, "solver must be a gradient transform"),
-    ({"model": DSMC, "start": ELASTIC}, "cannot start at dissipative_constant = 0.0"),
+    ({"model": DSMC, "start": ELASTIC}, "start at dissipative_constant = 0.0"),
     (
         {"measurement": measured(gas=SPLINE), "model": DSMC, "free": "law"},
         "KineticTheory.. or a solver of optax",
@@ -420,14 +420,14 @@ FITS = [
     (
         {"measurement": measured(gas=OF_TWO), "free": ("coefficient", T_0)}
         | {"model": jaxgran.HardSpheres(2, replicas=2, start=APART)},
-        "temperature cannot be fitted from a given start",
+        "temperature .*given start",
     ),
     # several measurements
     ({"measurement": TWO, "free": A, "separate": (A,)}, "different names"),
     ({"measurement": TWO, "model": jaxgran.DSMC(10)}, "a model without noise"),
-    ({"measurement": DISAGREE}, "give different values of it, 5e.07 .* and 6e.07"),
+    ({"measurement": DISAGREE}, "different values .*5e.07 .* and 6e.07"),
     ({"measurement": {"": measured()}}, "labels of measurements are texts"),
-    ({"measurement": measured(DROPS), "model": DSMC}, "drop tests are fitted by a model without"),
+    ({"measurement": measured(DROPS), "model": DSMC}, "drop tests .*a model without"),
     ({"measurement": measured(DROPS), "free": (A, "t0")}, "t0 needs a cooling curve"),
 ]
 CALLS += [(partial(fit, **change), words) for change, words in FITS]

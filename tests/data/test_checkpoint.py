@@ -4,14 +4,21 @@ import errno
 import hashlib
 import io
 import json
+import os
+import signal
+import subprocess
+import sys
+from functools import partial
 
 import jax
 import numpy as np
 import pytest
 
 import jaxgran
+from jaxgran.data import checkpoint
 from jaxgran.data.checkpoint import describe_run, differences
-from tests.beads import assert_same
+from jaxgran.particles import run as particle_run
+from tests.beads import assert_same, glass_beads
 from tests.test_contract import CASES
 
 ODD = {
@@ -203,3 +210,70 @@ def test_descriptions_of_functions_hold_what_they_keep():
     assert described(jax.jit(observable(3))) == three
     assert differences(described(jax.jit(observable(3))), described(jax.jit(recursive())))
     assert described(recursive()) == described(recursive())
+
+
+OWN_LAW = """
+import jax, jax.numpy as jnp
+from jaxgran.extend import ReducedLaw, RestitutionLaw
+from jaxgran.data.checkpoint import describe_run
+def slow(v): return FACTOR * jnp.ones_like(v)
+class Own(RestitutionLaw, ReducedLaw):
+    function: object
+    domains = {}
+    def reduced(self, *, diameter, mass, speed): return self
+    def restitution(self, normal_speed): return self.function(normal_speed)
+print(describe_run(law=Own(jax.tree_util.Partial(slow))))
+"""
+
+
+@pytest.mark.slow
+def test_a_users_law_is_described_alike_in_another_process(tmp_path):
+    def described(factor):
+        script = tmp_path / "own.py"
+        script.write_text(OWN_LAW.replace("FACTOR", factor))
+        return subprocess.check_output([sys.executable, script])
+
+    assert described("0.9") == described("0.9") != described("0.8")
+
+
+def test_files_keep_permissions_and_follow_links(tmp_path):
+    curve = jaxgran.CoolingCurve([0.1, 0.2, 0.3, 0.4], [4e-3, 3e-3, 2e-3, 1e-3])
+    target, link = tmp_path / "target.csv", tmp_path / "link.csv"
+    target.write_text("old")
+    target.chmod(0o640)
+    link.symlink_to(target)
+    jaxgran.write_curve(link, curve, {}, overwrite=True)
+    assert link.is_symlink() and target.read_text().startswith("t,T")
+    assert target.stat().st_mode & 0o777 == 0o640
+    old = os.umask(0o022)
+    try:
+        jaxgran.write_curve(tmp_path / "new.csv", curve, {})
+    finally:
+        os.umask(old)
+    assert (tmp_path / "new.csv").stat().st_mode & 0o777 == 0o644
+
+
+def test_a_termination_saves_the_run_and_then_ends_the_process(tmp_path, monkeypatch):
+    ended = []
+    calls = []
+    ready = particle_run.block_until_ready
+    path = tmp_path / "run.ckpt"
+    gas = glass_beads(0.3, packing_fraction=0.1)
+    times = float(gas.mean_free_time) * np.asarray([1.0, 2.0, 3.0])
+    cool = partial(jaxgran.cool, gas, times, model=jaxgran.DSMC(200), progress=False)
+    whole = cool()
+
+    def ready_and_terminated(tree):
+        calls.append(0)
+        if len(calls) == 3:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return ready(tree)
+
+    monkeypatch.setattr(checkpoint.signal, "raise_signal", ended.append)
+    monkeypatch.setattr(particle_run, "block_until_ready", ready_and_terminated)
+    with pytest.raises(KeyboardInterrupt):
+        cool(checkpoint=path)
+    assert ended == [signal.SIGTERM] and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    calls = [0] * 3
+    continued = cool(checkpoint=path)
+    np.testing.assert_array_equal(continued.temperature, whole.temperature)

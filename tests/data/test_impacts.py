@@ -99,15 +99,15 @@ VELOCITIES = "nx,ny,nz,vx,vy,vz,vx_after,vy_after,vz_after,v_err"
 @pytest.mark.parametrize(
     "text, message",
     [
-        ("v,eps,eps_err\n.1,1.3,.1\n", "line 2: eps is 1.3, allowed are 0 to 1.2"),
-        ("v,eps,eps_err\n.1,-.1,.1\n", "line 2: eps is -0.1, allowed are 0 to 1.2"),
+        ("v,eps,eps_err\n.1,1.3,.1\n", "line 2: eps is 1.3, .* 0 to 1.2"),
+        ("v,eps,eps_err\n.1,-.1,.1\n", "line 2: eps is -0.1, .* 0 to 1.2"),
         (
             "v,angle,eps,eps_err,eps_t,eps_t_err\n.1,95,.9,.1,.2,.1\n",
             "line 2: angle is 95, allowed are 0 to 90. It is from the normal, in degrees",
         ),
-        (OBLIQUE + ".1,.1,.9,.1,1.5,.1\n", "line 2: eps_t is 1.5, allowed are -1.1 to 1.1"),
+        (OBLIQUE + ".1,.1,.9,.1,1.5,.1\n", "line 2: eps_t is 1.5, .* -1.1 to 1.1"),
         (OBLIQUE + ".1,0,.9,.1,.5,.1\n", "tangential_speed must lie in .* normal impacts are"),
-        ("v_n,v_t,eps,eps_err,beta_t\n", "a column beta_t has the sign of the model: write eps_t"),
+        ("v_n,v_t,eps,eps_err,beta_t\n", "column beta_t .*write eps_t"),
         (
             "v_n,v_t,eps,eps_err,eps_t,eps_t_err,eps_t_center\n",
             "two definitions of the tangential restitution",
@@ -147,11 +147,11 @@ def test_impacts_need_the_elements_on_which_they_depend():
     )  # fmt: skip
     with pytest.raises(ValueError, match="eps_t needs rough spheres .* `beta_t: guess`"):
         jaxgran.Measurement(smooth, oblique)
-    with pytest.raises(ValueError, match="impacts onto a wall need the walls of the gas"):
+    with pytest.raises(ValueError, match="need the walls of the gas"):
         jaxgran.Measurement(smooth, jaxgran.DropTest([0.1], [0.9], [0.01], "wall"))
-    with pytest.raises(ValueError, match="onto must be one of sphere, plate, wall, got True"):
+    with pytest.raises(ValueError, match="onto .*sphere, plate, wall, got True"):
         jaxgran.DropTest([0.1], [0.9], [0.01], True)
-    with pytest.raises(ValueError, match="are given together, got tangential_speed"):
+    with pytest.raises(ValueError, match="together, got tangential_speed"):
         jaxgran.DropTest([0.1], [0.9], [0.01], tangential_speed=[0.1])
     wall = jaxgran.DropTest([0.1], [0.9], [0.01], "wall")
     assert float(wall.computed(jaxgran.Measurement(ROUGH, wall).gas)[0]) == pytest.approx(0.8)

@@ -117,7 +117,7 @@ def test_trackpy_names_and_further_columns(read):
     columns = i, y, x, z, np.full(60, 12.5), np.full(60, np.nan), frame, i
     columns = [column[::-1] for column in columns]  # rows may stand in any order
     names, rate = ",y,x,z,mass,ecc,frame,particle\n", float(1 / times[1])
-    with pytest.raises(ValueError, match="add '# frame_rate: ...', in frames per second"):
+    with pytest.raises(ValueError, match="add '# frame_rate: ...'"):
         read(names, *columns)
     second, header = read(f"# N: 200\n# frame_rate: {rate}\n{names}", *columns)
     np.testing.assert_allclose(second.temperature, first.temperature, rtol=1e-12)

@@ -37,3 +37,13 @@ def test_links_lead_somewhere(path):
             heads = re.findall(r"^#+ (.*)$", other.read_text(encoding="utf-8"), re.MULTILINE)
             names = [re.sub(r"[^\w -]", "", head.lower()).replace(" ", "-") for head in heads]
             assert anchor in names, f"{path.name}: {other.name} has no heading {anchor}"
+
+
+def test_the_table_of_faults_names_tests_that_exist():
+    text = (ROOT / "tests" / "faults.md").read_text()
+    named = re.findall(r"([\w/]+\.py)(?:::(\w+)(?:\[(.*?)\])?)?", text.partition("|---")[2])
+    assert len(named) > 40
+    for file, function, case in named:
+        code = (ROOT / "tests" / file).read_text()
+        assert not function or f"def {function}(" in code, function
+        assert not case or f'"{case}"' in code, case

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 
 import jaxgran
-from experiments.support.scenes import of_lammps
 from tests.beads import glass_beads
 
 A = "dissipative_constant"
@@ -46,11 +45,6 @@ def cooled_beads(seed=0, **options):
 def rough_beads(tangential_restitution=0.0):
     surface = jaxgran.Rough(tangential_restitution, rotational_temperature=3e-3)
     return dataclasses.replace(glass_beads(), surface=surface)
-
-
-def measured(name):
-    """A curve measured in LAMMPS, with its gas."""
-    return of_lammps(name)
 
 
 def fitted(gas, curve, free=(A,), **options):

@@ -20,14 +20,13 @@ from tests.fitting.curves import (
     deviation,
     fitted,
     in_range,
-    measured,
     synthetic,
 )
 
 
 @pytest.mark.slow
 def test_a_search_that_was_cut_short_is_said_to_be():
-    result = jaxgran.fit(measured("dilute"), max_steps=1)
+    result = jaxgran.fit(jaxgran.example_measurement("dilute"), max_steps=1)
     assert not result.converged and result.ranges == {}
     assert result.grade == "not consistent" and "did not converge" in result.verdict
     assert any("increase max_steps" in reason for reason in result.reasons)
@@ -35,7 +34,7 @@ def test_a_search_that_was_cut_short_is_said_to_be():
 
 @pytest.mark.slow
 def test_dense_measured_curve_is_not_explained():
-    measurement = measured("dense")
+    measurement = jaxgran.example_measurement("dense")
     result = jaxgran.fit(measurement, free=(A,))
     # The known failure of kinetic theory here: 5 to 25 % off.
     assert 0.7 < result.estimate[0] / measurement.gas.value(A) < 0.95
@@ -72,7 +71,7 @@ def test_a_valid_scene_has_no_limitations():
 
 
 def test_every_model_has_limitations_in_a_dense_scene():
-    measurement = measured("dense")
+    measurement = jaxgran.example_measurement("dense")
     gas = measurement.gas
     n = measurement.num_particles
     theory, dsmc, hard, soft = (model.limitations(gas, n) for model in models_of(n))
@@ -232,3 +231,26 @@ def test_declared_absences_narrow_the_range():
     widths = [np.ptp(np.ravel(result.ranges[A])) for result in (whole, narrow)]
     assert widths[1] < 0.7 * widths[0]
     assert "declare `absent: " in whole.narrowing and narrow.narrowing == ""
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:this curve does not determine")
+def test_no_alternatives_of_a_curve_in_other_units():
+    gas = glass_beads(0.15)
+    curve = synthetic(gas, num_points=8)
+    for factor in (300.0, 1e6):
+        scaled = jaxgran.CoolingCurve(
+            curve.times,
+            factor * curve.temperature,
+            temperature_error=factor * curve.temperature_error,
+        )
+        fit = fitted(gas, scaled, quick=False)
+        assert fit.grade == "not consistent" and not fit.alternatives
+        assert "check the units, the scale of T and T0" in str(fit.reasons)
+
+
+@pytest.mark.filterwarnings("ignore:this curve does not determine")
+def test_a_curve_that_rises_is_not_explained_by_scatter():
+    curve = jaxgran.CoolingCurve([1.0, 2.0, 3.0, 4.0], [0.01, 0.011, 0.012, 0.013])
+    fit = fitted(glass_beads(0.15), curve, quick=True)
+    assert fit.grade == "not consistent" and "T rises from 0.01 to 0.013" in str(fit.reasons)

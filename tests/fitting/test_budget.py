@@ -8,7 +8,7 @@ import pytest
 import jaxgran
 from jaxgran.models.choose import error_model_of
 from tests.beads import glass_beads, soft_beads
-from tests.fitting.curves import BOTH, cooled_beads, fitted, in_range, measured, synthetic
+from tests.fitting.curves import BOTH, cooled_beads, fitted, in_range, synthetic
 
 
 def relative(result, part):
@@ -37,7 +37,7 @@ refits of the dilute curve at other values."""
 @pytest.mark.slow
 def test_inputs_are_propagated():
     # <dr^2> would tell the diameter, too: the mean free path is proportional to it.
-    m = measured("dilute")
+    m = jaxgran.example_measurement("dilute")
     m = dataclasses.replace(m, data=dataclasses.replace(m.data, displacement=None))
     values, part = {"diameter": float(m.gas.diameter), "density": float(m.gas.density)}, "diameter"
 

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 import jaxgran
+from jaxgran import read_measurement
 from tests.beads import glass_beads
+from tests.data.curve_files import IN_MM, PLAIN, TIMES, T, text_of
 from tests.fitting.curves import A, deviation, in_range, synthetic
 
 
@@ -85,3 +87,11 @@ def test_curves_and_drops_together():
     contradicted = jaxgran.fit(data, separate=("temperature",))
     assert contradicted.p_value < 1e-4
     assert "is not consistent" in contradicted.verdict
+
+
+def test_two_copies_are_one_measurement(write):
+    first = read_measurement(write(PLAIN))
+    for other in (PLAIN, IN_MM.replace("t,T,", "t (ms),T (mm^2/s^2),"), text_of("t,T", (TIMES, T))):
+        copies = {"a": first, "b": read_measurement(write(other))}
+        with pytest.raises(ValueError, match="'a' and 'b' .*same values"):
+            jaxgran.fit(copies)

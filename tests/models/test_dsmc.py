@@ -11,7 +11,7 @@ import jaxgran
 from jaxgran import DSMC
 from jaxgran.particles.dsmc import collisions, dynamics
 from tests.beads import SI, curves_of, glass_beads, hard_gas, without
-from tests.test_sliding import sliding
+from tests.scene.test_sliding import sliding
 
 # Hard spheres: kinetic theory without the correction for soft contacts.
 THEORY = jaxgran.KineticTheory(corrections=without("softness", "correlations"))

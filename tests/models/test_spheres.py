@@ -148,3 +148,31 @@ def test_compiled_runs_of_few_hard_spheres_have_room():
     times = 0.5 * gas.mean_free_time[None]
     run = jax.jit(jax.vmap(lambda key: jaxgran.cool(gas, times, model=model, key=key).status))
     assert not np.any(run(jax.random.split(jax.random.key(0), 60)))
+
+
+def two_spheres(gas, distance, speed):
+    """Two spheres at a distance in diameters that approach each other."""
+    side, apart = gas.box_side(2), np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    return spheres(0.5 * (side + distance * gas.diameter * apart), -speed * apart, side)
+
+
+def test_soft_spheres_that_start_overlapping_are_told():
+    gas = glass_beads(0.3, packing_fraction=0.02)
+    SoftSpheres(2, start=two_spheres(gas, 1.01, 0.1)).check(gas)
+    with pytest.warns(UserWarning, match="overlap: .* J"):
+        SoftSpheres(2, start=two_spheres(gas, 0.95, 0.1)).check(gas)
+
+
+@pytest.mark.slow
+def test_heavily_damped_impacts_end():
+    gas = glass_beads(1e4, packing_fraction=0.02)
+    start = two_spheres(gas, 1.05, 0.1)
+    times = [0.0, float(glass_beads(0.3, packing_fraction=0.1).mean_free_time)]
+    soft, hard = (
+        jaxgran.cool(gas, times, model=kind(2, start=start), progress=False)
+        for kind in (SoftSpheres, HardSpheres)
+    )
+    ratio = soft.temperature / hard.temperature
+    np.testing.assert_allclose(ratio, 1.0, atol=0.005)
+    assert hard.temperature[1] < 1e-8 * hard.temperature[0]
+    np.testing.assert_allclose(soft.dissipated_energy, hard.dissipated_energy, rtol=1e-3)

@@ -134,7 +134,7 @@ def test_wrap_lands_inside(side):
 
 
 def test_engine_follows_the_device_and_the_gas(monkeypatch):
-    with pytest.raises(ValueError, match="must be one of auto, sweep, cells, jax-md, got 'scipy'"):
+    with pytest.raises(ValueError, match="auto, sweep, cells, jax-md, got 'scipy'"):
         check_engine("scipy")
     assert compiled_engine("cells", 1.0) == "cells" and compiled_engine("sweep", 1e6) == "sweep"
     for name in ("auto", "jax-md"):
@@ -253,6 +253,6 @@ def test_no_pair_just_within_the_cutoff_is_missed(dtype, search):
 def test_a_search_over_too_many_is_refused(search, possible):
     position = jax.ShapeDtypeStruct((2**26, 3), jnp.float32)
     look = partial(search, side=1000.0, cutoff=1.0, replicas=1, capacity=9, ahead=2**10)
-    message = f"{search.__name__}.* cannot look 1024 particles ahead: .* allow {possible} ahead"
+    message = f"{search.__name__}.*1024.* allow {possible}"
     with pytest.raises(ValueError, match=message):
         jax.eval_shape(look, position)

@@ -140,7 +140,7 @@ def test_a_run_that_ends_early_is_resumed_and_then_read_back(tmp_path, monkeypat
     with monkeypatch.context() as patch:
         Calls(patch, 0)
         assert_same(on_host(recorder, checkpoint=path), whole)
-    with pytest.raises(ValueError, match="belongs to another run: fails_at was"):
+    with pytest.raises(ValueError, match="another run: fails_at"):
         on_host(decaying(fails_at=9.0), checkpoint=path)
 
 

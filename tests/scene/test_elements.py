@@ -1,5 +1,4 @@
 import dataclasses
-import re
 
 import jax
 import jax.numpy as jnp
@@ -8,10 +7,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jaxgran
-from jaxgran.data.header import gas_of_header
 from jaxgran.theory.averages import impact_moments
 from tests.beads import SI, glass_beads, hard_gas, theory_curve, without
-from tests.data.test_faults_csv import gas_of, header_of
+from tests.data.curve_files import ROUGH, gas_of
 
 TAUS = np.geomspace(1.0, 300.0, 8)
 
@@ -135,43 +133,9 @@ def test_a_viscoelastic_wall_is_softer_by_the_root_of_two():
     assert float(wall.length) == pytest.approx(float(pair.length), rel=1e-12)
 
 
-FLOATS = {
-    "beta_t": "tangential_restitution",
-    "T_rot_0": "rotational_temperature",
-    "container_side": "wall_side",
-    "wall_restitution": "wall_coefficient",
-    "wall_beta_t": "wall_tangential_restitution",
-    "gamma": "drag_rate",
-}
-"""Floats of the gas that keys of headers give, where their names differ."""
-
-ROUGH = {"beta_t": "-0.2", "friction": "0.4", "T_rot_0": "2e-3", "container_side": "0.089"}
-ROUGH |= {"wall_restitution": "0.9", "wall_beta_t": "0.1", "gamma": "0.3"}
-ROUGH |= {"drive_strength": "2.5e-4"}
-ELEMENTS = ("surface", "container", "drag", "drive")
-FRICTION = {"friction": "0.3", "tangential_damping": "0.5", "T_rot_0": "2e-3"}
-
-
-@pytest.mark.parametrize("keys, elements", [(ROUGH, ELEMENTS), (FRICTION, ("friction",))])
-def test_elements_are_read_from_a_header(keys, elements):
-    gas = gas_of(**keys)
-    assert gas.elements == elements and float(gas.value("inertia")) == 0.4
-    for key, text in keys.items():
-        assert float(gas.value(FLOATS.get(key, key))) == float(text)
-
-
-def test_a_header_may_say_that_there_is_nothing_of_it():
-    assert gas_of(gravity=0, aspect_ratio=1).elements == ()
-
-
-def test_unknown_header_keys_are_told():
-    _, (question,) = gas_of_header(header_of(**{"mu": "0.5", "A comment of some words": "x"}))
-    assert re.match("ignoring unknown header keys: mu. Known keys are eta.*friction", question)
-
-
 def test_a_box_that_does_not_hold_other_spheres_is_refused_in_a_choice():
     fits = gas_of(**ROUGH)
-    with pytest.raises(ValueError, match="100 spheres of .* 0.04 need .* set packing_fraction"):
+    with pytest.raises(ValueError, match="100 spheres .*0.04.* container"):
         jaxgran.choose_model(fits, [1.0], num_particles=100)
 
 

@@ -1,4 +1,6 @@
+import copy
 import dataclasses
+import pickle
 
 import jax
 import jax.numpy as jnp
@@ -84,3 +86,28 @@ def test_contact_value_of_a_dilute_gas(dimension, second_virial):
     per_packing = {2: 4 / np.pi, 3: 6 / np.pi}[dimension]
     # Henderson's formula has 25/16 for 1.5640.
     np.testing.assert_allclose(slope, third * second_virial * per_packing, rtol=2e-3)
+
+
+def test_repr_of_a_gas_has_units():
+    gas = glass_beads()
+    words = repr(gas)
+    assert "dissipative_constant" in words and "m^2/s^2" in words and "f64[]" not in words
+    assert f"{float(gas.mean_free_time):.4g} s" in words
+    assert words.startswith("Gas of Viscoelastic spheres, d = 3")
+
+
+def test_repr_marks_batches_and_traced_values():
+    gas, shown = glass_beads(), []
+    jax.jit(lambda gas: shown.append(repr(gas)) or gas.temperature)(gas)
+    assert "traced" in shown[0]
+    many = jax.vmap(lambda a: gas.replace(dissipative_constant=a))(jnp.ones(3))
+    assert "values of shape (3,)" in repr(many)
+
+
+def test_floats_of_parts_are_attributes_of_the_gas():
+    gas = glass_beads().replace(dissipative_constant=2e-6)
+    assert float(gas.dissipative_constant) == 2e-6
+    with pytest.raises(AttributeError, match="Gas has no attribute 'viscosity'"):
+        _ = gas.viscosity
+    for again in (copy.deepcopy(gas), pickle.loads(pickle.dumps(gas))):
+        np.testing.assert_array_equal(again.dissipative_constant, gas.dissipative_constant)

@@ -4,7 +4,6 @@ import pytest
 
 import jaxgran
 from tests.beads import glass_beads, hard_gas, soft_beads
-from tests.fitting.curves import measured
 
 
 def over(gas, collision_times):
@@ -25,7 +24,7 @@ def errors(choice):
     [("dense", jaxgran.SoftSpheres, 0.76), ("dilute", jaxgran.KineticTheory, 0.987)],
 )
 def test_measured_curves(name, model, fitted):
-    measurement = measured(name)
+    measurement = jaxgran.example_measurement(name)
     gas, curve = measurement.gas, measurement.curve
     a_true = float(dict(measurement.header)["A"])
     options = {"num_particles": measurement.num_particles, "replicas": measurement.replicas}
@@ -158,3 +157,12 @@ def test_cool_chooses():
     times = over(gas, 10)
     chosen = jaxgran.cool(gas, times, model="auto", tolerance=np.float32(0.05), num_particles=1000)
     np.testing.assert_array_equal(chosen.temperature, jaxgran.cool(gas, times).temperature)
+
+
+def test_repr_of_a_curve_and_of_a_choice():
+    curve = jaxgran.CoolingCurve([0.0, 1.0, 2.0], [4.0, 2.0, 1.0], temperature_error=[1, 1, 1])
+    assert "3 times, t = 0 s to 2 s" in repr(curve) and "0.25" in repr(curve)
+    assert "temperature, temperature_error" in repr(curve)
+    choice = jaxgran.Choice(jaxgran.KineticTheory(), ("is cheap", "is exact"), (), 0.012)
+    assert repr(choice).startswith("Choice: kinetic theory, T within 1.2 %")
+    assert all(reason in repr(choice) for reason in choice.reasons)

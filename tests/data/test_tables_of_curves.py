@@ -1,20 +1,15 @@
-"""Gases, curves and choices in a notebook: words, tables and pictures."""
+"""Curves as datasets of xarray and tables of pandas."""
 
-import copy
 import dataclasses
-import pickle
 import sys
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from matplotlib import pyplot
 
 import jaxgran
-from experiments.fit.own_model import HaffLaw
-from tests.beads import SI, assert_same, glass_beads, hard_gas
+from tests.beads import assert_same
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +52,7 @@ def test_a_dataset_has_saved_values(curve, tmp_path):
     assert data["saved_of_replicas.S.1"].dims == ("replica", "time")
     np.testing.assert_array_equal(data["saved.S.0"], each.mean(0))
     np.testing.assert_allclose(data["saved_error.S.1"], 8 / 2)
-    with pytest.raises(ValueError, match="the key 'a.b': keys name arrays"):
+    with pytest.raises(ValueError, match="key 'a.b'"):
         curve.with_saved({"a.b": each}).to_xarray()
     whole = jaxgran.Particles(*(jnp.ones((4, 2, 3, 3)) for _ in range(2)), 2 * jnp.ones(4))
     saved = dataclasses.replace(curve, saved=whole)
@@ -84,7 +79,7 @@ def test_a_table_of_pandas_comes_back(curve):
     table = curve.to_pandas().reset_index().rename(columns={"times": "t", "temperature": "T"})
     named = jaxgran.CoolingCurve.from_pandas(table)
     np.testing.assert_array_equal(named.temperature, curve.temperature)
-    with pytest.raises(ValueError, match="the column speed is not of a curve"):
+    with pytest.raises(ValueError, match="column speed"):
         jaxgran.CoolingCurve.from_pandas(table.rename(columns={"T": "speed"}))
 
 
@@ -99,7 +94,7 @@ def test_every_quantity_of_a_curve_has_a_unit(curve):
 def test_a_batch_of_curves_is_refused(curve):
     two = jax.tree.map(lambda x: jnp.stack([x, x]), curve)
     for show in (two.to_xarray, two.to_pandas):
-        with pytest.raises(ValueError, match="times of this curve have shape"):
+        with pytest.raises(ValueError, match="times .*have shape"):
             show()
 
 
@@ -108,89 +103,3 @@ def test_a_missing_library_is_reported(curve, library, monkeypatch):
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(ModuleNotFoundError, match=f"needs {library}: pip install"):
         getattr(curve, f"to_{library}")()
-
-
-def test_a_curve_is_drawn_in_given_axes(curve):
-    figure, axes = pyplot.subplots()
-    assert jaxgran.plot_curve(curve, axes, label="mine") is axes
-    drawn: Any = axes.containers[0].get_children()[0]
-    np.testing.assert_array_equal(drawn.get_xdata(), curve.times[1:])  # 0 has no logarithm
-    np.testing.assert_array_equal(drawn.get_ydata(), curve.temperature[1:])
-    assert axes.get_xscale() == axes.get_yscale() == "log"
-    assert axes.get_legend_handles_labels()[1] == ["mine"]
-    assert jaxgran.plot_curve(curve) is pyplot.gca()
-    pyplot.close("all")
-
-
-def test_a_fit_is_drawn_with_its_residuals():
-    gas = hard_gas(0.9, 0.02, **SI)
-    times = np.geomspace(1.0, 100.0, 20) * float(gas.mean_free_time)
-    T = jaxgran.cool(gas, times, model=HaffLaw()).temperature
-    noisy = T * (1 + 0.01 * np.random.default_rng(0).normal(size=20))
-    curve = jaxgran.CoolingCurve(times, noisy, temperature_error=0.01 * T)
-    result = jaxgran.fit(jaxgran.Measurement(gas, curve), model=HaffLaw(), quick=True)
-    top, bottom = jaxgran.plot_fit(result)
-    points: Any = top.containers[0].get_children()[0]
-    np.testing.assert_array_equal(points.get_ydata(), noisy)
-    np.testing.assert_array_equal(top.lines[1].get_ydata(), result.curve.temperature)
-    drawn: Any = bottom.lines[-1]
-    np.testing.assert_array_equal(drawn.get_ydata(), result.residuals[""]["temperature"])
-    pyplot.close("all")
-    with pytest.raises(ValueError, match=r"axes must be two, .* got shape \(3,\)"):
-        jaxgran.plot_fit(result, np.zeros(3))
-
-
-def test_a_fit_of_several_measurements_is_not_drawn():
-    each = {"first": [0.92, 0.9], "second": [0.91, 0.9]}
-    several = jaxgran.fit(
-        {
-            name: jaxgran.Measurement(
-                glass_beads(), jaxgran.DropTest([0.1, 0.3], eps, [0.01, 0.01])
-            )
-            for name, eps in each.items()
-        },
-        quick=True,
-    )
-    with pytest.raises(ValueError, match="one curve, got one of first, second. Draw each"):
-        jaxgran.plot_fit(several)
-    pyplot.close("all")
-
-
-def test_plot_functions_are_imported_on_first_use():
-    assert set(dir(jaxgran)) == {*jaxgran.__all__, "plot_curve", "plot_fit", "plot_plan"}
-    with pytest.raises(AttributeError, match="no attribute 'plot_nothing'"):
-        _ = jaxgran.plot_nothing
-
-
-def test_repr_of_a_gas_has_units():
-    gas = glass_beads()
-    words = repr(gas)
-    assert "dissipative_constant" in words and "m^2/s^2" in words and "f64[]" not in words
-    assert f"{float(gas.mean_free_time):.4g} s" in words
-    assert words.startswith("Gas of Viscoelastic spheres, d = 3")
-
-
-def test_repr_of_a_curve_and_of_a_choice():
-    curve = jaxgran.CoolingCurve([0.0, 1.0, 2.0], [4.0, 2.0, 1.0], temperature_error=[1, 1, 1])
-    assert "3 times, t = 0 s to 2 s" in repr(curve) and "0.25" in repr(curve)
-    assert "temperature, temperature_error" in repr(curve)
-    choice = jaxgran.Choice(jaxgran.KineticTheory(), ("is cheap", "is exact"), (), 0.012)
-    assert repr(choice).startswith("Choice: kinetic theory, T within 1.2 %")
-    assert all(reason in repr(choice) for reason in choice.reasons)
-
-
-def test_repr_marks_batches_and_traced_values():
-    gas, shown = glass_beads(), []
-    jax.jit(lambda gas: shown.append(repr(gas)) or gas.temperature)(gas)
-    assert "traced" in shown[0]
-    many = jax.vmap(lambda a: gas.replace(dissipative_constant=a))(jnp.ones(3))
-    assert "values of shape (3,)" in repr(many)
-
-
-def test_floats_of_parts_are_attributes_of_the_gas():
-    gas = glass_beads().replace(dissipative_constant=2e-6)
-    assert float(gas.dissipative_constant) == 2e-6
-    with pytest.raises(AttributeError, match="Gas has no attribute 'viscosity'"):
-        _ = gas.viscosity
-    for again in (copy.deepcopy(gas), pickle.loads(pickle.dumps(gas))):
-        np.testing.assert_array_equal(again.dissipative_constant, gas.dissipative_constant)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import jaxgran
-from tests.sweeps.process import TIMES, members
+from tests.sweep_process import TIMES, members
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[1]
 
 
 def run(processes, store, number, die_at=-1):
@@ -20,7 +20,7 @@ def run(processes, store, number, die_at=-1):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    command = [sys.executable, "-m", "tests.sweeps.process", str(port)]
+    command = [sys.executable, "-m", "tests.sweep_process", str(port)]
     rest = [str(x) for x in (processes, store, number, die_at)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "cwd": ROOT}
     started = [subprocess.Popen([*command, str(i), *rest], **pipes) for i in range(processes)]

@@ -74,9 +74,9 @@ def test_a_trajectory_goes_on_where_it_ended(tmp_path, suffix, digits):
         read = jaxgran.read_particles(path, frame=k)
         expected = particles(seed=k).velocity
         np.testing.assert_allclose(read.velocity, expected, atol=4 * digits, rtol=0)
-    with pytest.raises(ValueError, match="5 frames, there is no frame 5"):
+    with pytest.raises(ValueError, match="5 frames, .* frame 5"):
         jaxgran.read_particles(path, frame=5)
-    with pytest.raises(ValueError, match="has 5 frames, but the checkpoint continues with frame 7"):
+    with pytest.raises(ValueError, match="5 frames, .* frame 7"):
         write_frames(path, [7], resumed=True)
 
 
@@ -85,7 +85,7 @@ def test_half_a_frame_is_cut_off(tmp_path):
     write_frames(path, range(2))
     whole = path.read_bytes()
     path.write_bytes(whole[:-30])
-    with pytest.raises(ValueError, match="it ends within a line"):
+    with pytest.raises(ValueError, match="ends within a line"):
         jaxgran.read_particles(path)
     read = jaxgran.read_particles(path, frame=-2)
     np.testing.assert_array_equal(read.velocity, particles().velocity)

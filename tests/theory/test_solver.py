@@ -7,6 +7,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import jaxgran
+from tests.beads import glass_beads
 
 TAUS = jnp.array([0.3, 3.0, 30.0, 300.0])
 
@@ -74,3 +75,15 @@ def test_second_derivative():
     hessian = jax.jacfwd(jax.grad(loss))(x)
     difference = (jax.grad(loss)(x + h) - jax.grad(loss)(x - h)) / (2 * h)
     np.testing.assert_allclose(hessian, difference, rtol=1e-4)
+
+
+def test_a_solver_that_fails_has_no_derivative():
+    gas = glass_beads(0.3, packing_fraction=0.1)
+    model = jaxgran.KineticTheory(max_steps=2)
+    times = gas.mean_free_time * jnp.asarray([1.0, 1e4])
+
+    def temperature(A):
+        changed = gas.replace(dissipative_constant=A)
+        return jaxgran.cool(changed, times, model=model).temperature[-1]
+
+    assert np.all(np.isnan(jax.jit(jax.value_and_grad(temperature))(gas.dissipative_constant)))

@@ -152,7 +152,7 @@ class OneRun(StandIn):
 
 
 def test_curves_without_replicas_are_refused():
-    with pytest.raises(ValueError, match="OneRun needs curves with at least two replicas"):
+    with pytest.raises(ValueError, match="OneRun .*two replicas"):
         fitted(OneRun())
 
 
@@ -165,7 +165,7 @@ def test_more_runs_make_it_quieter():
 
 
 def test_what_the_curve_does_not_tell_stays_where_it_was():
-    with pytest.warns(UserWarning, match="does not determine A and T0"):
+    with pytest.warns(UserWarning, match="A and T0"):
         found = fitted(StandIn(formula=of_sum), (0.3, 0.0), first=(0.1, 0.1))
     flat = logs(found.gas)
     assert float(flat[0] - flat[1]) == pytest.approx(0.0, abs=1e-6)

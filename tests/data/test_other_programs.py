@@ -225,7 +225,7 @@ def test_units_of_lammps(tmp_path, units, length, speed):
 def test_disks_in_space_are_asked_about(tmp_path):
     flat = dump(names="id z vz x y a vx vy b", columns=(IDS, [0] * N, [0] * N))
     path = write(tmp_path / "a.dump", flat)
-    with pytest.raises(ValueError, match="move in one plane: give dimension=2"):
+    with pytest.raises(ValueError, match="plane: give dimension=2"):
         jaxgran.read_particles(path)
     assert jaxgran.read_particles(path, dimension=2).velocity.shape == (1, N, 2)
 
@@ -313,7 +313,7 @@ def test_tracks(read, name, d):
 
 def test_wrapped_tracks_are_refused(read):
     columns, _, side = tracks(wrapped=True, swaps=(7,))
-    with pytest.raises(ValueError, match="as long as the box.*'# box_side: ...'") as error:
+    with pytest.raises(ValueError, match="the box.*'# box_side: ...'") as error:
         read("id,t,x,y,z\n", *columns)
     suggested = float(re.search(r"side, ([\d.]+) m", str(error.value))[1])
     assert suggested == pytest.approx(side, rel=0.02)
@@ -406,6 +406,6 @@ def test_positions_without_a_track_are_left_out(tmp_path, nothing):
     head = "TRACK_ID,POSITION_T,POSITION_X,POSITION_Y,POSITION_Z"
     path = write(tmp_path / "spots.csv", "\n".join([head, *rows]) + "\n")
     number = len(rows) - len(ids)
-    with pytest.warns(UserWarning, match=f"{number} positions that belong to no track are left"):
+    with pytest.warns(UserWarning, match=f"{number} positions .*no track"):
         curve = jaxgran.read_curve(path)[0]
     np.testing.assert_allclose(np.mean(curve.temperature / T), 1.0, atol=0.1)

@@ -1,6 +1,6 @@
 """One process of a sweep over several processes.
 
-    python -m tests.sweeps.process PORT INDEX PROCESSES STORE MEMBERS [DIE_AT]
+    python -m tests.sweep_process PORT INDEX PROCESSES STORE MEMBERS [DIE_AT]
 
 Prints the number of each chunk that it has computed; kills itself before chunk DIE_AT is written.
 """

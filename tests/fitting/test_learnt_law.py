@@ -61,7 +61,7 @@ def test_names_of_the_arrays_of_a_law():
     assert jnp.all(gas.replace(**{WEIGHT: jnp.ones((3, 1))}).value(WEIGHT) == 1)
     with pytest.raises(ValueError, match="got 'tanh'"):
         gas_of(Network("tanh"))
-    with pytest.raises(ValueError, match="SoftSpheres needs the Viscoelastic law"):
+    with pytest.raises(ValueError, match="SoftSpheres needs .*Viscoelastic"):
         jaxgran.cool(gas, [1.0], model=jaxgran.SoftSpheres(64))
 
 
@@ -161,7 +161,7 @@ def test_a_law_is_learnt_from_a_curve(caplog):
     with jax.log_compiles(), pytest.warns(UserWarning, match=words):
         fitted(gas_of(wide), curve, free="law", num_particles=10**7)
     assert "Compiling" not in caplog.text  # other knots share the programs
-    with pytest.raises(ValueError, match="no number of the law was free"):
+    with pytest.raises(ValueError, match="number of the law"):
         jaxgran.restitution_band(fitted(true, curve, free=("temperature",)))
 
 

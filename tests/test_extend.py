@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import jaxgran
-from experiments.fit.own_model import HaffLaw
 from jaxgran.extend import AbstractModel
 from tests.beads import SI, glass_beads, hard_gas
 from tests.fitting.curves import synthetic
+from tests.own_model import HaffLaw
 
 MEMBERS = sorted(AbstractModel.__abstractmethods__ | AbstractModel.__abstractclassvars__)
 

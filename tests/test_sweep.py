@@ -14,7 +14,7 @@ import pytest
 import jaxgran
 from jaxgran import observables
 from tests.beads import assert_same, glass_beads, hard_gas, without
-from tests.sweeps.process import TIMES, members
+from tests.sweep_process import TIMES, members
 
 GAS, GASES = glass_beads(), members(5)
 A = GASES.value("dissipative_constant")
@@ -171,14 +171,14 @@ def test_other_files_and_folders_are_refused_and_left_alone(tmp_path):
     pytest.importorskip("zarr")
     (tmp_path / "notes.txt").write_text("mine")
     for path in (tmp_path / "notes.txt", tmp_path):
-        with pytest.raises(ValueError, match="is not the store of a sweep .*Name another folder"):
+        with pytest.raises(ValueError, match="not the store .*Name another folder"):
             sweep(store=path)
     assert files(tmp_path) == {tmp_path / "notes.txt": b"mine"}
 
 
 def test_members_that_fail_are_nan_and_do_not_end_the_others():
     sweep = inspect.unwrap(jaxgran.sweep)  # which the check of its annotations calls
-    with pytest.warns(UserWarning, match="members 0 to 1 .* first of them is 1") as warned:
+    with pytest.warns(UserWarning, match="members 0 to 1 .* is 1") as warned:
         curves = sweep(dense(0.05, 0.9, 0.1), progress=False, **SAVED)
     assert np.isnan(curves.temperature[1]).all() and np.all(curves.temperature[::2] > 0)
     number = curves.replicas.saved["num"]
@@ -275,5 +275,5 @@ def test_ambiguous_wall_sides_are_refused():
     box = dataclasses.replace(GAS, container=walls)
     curves = sweep(jax.vmap(lambda a: box.replace(dissipative_constant=a))(A))
     assert curves.temperature.shape == (5, 3)
-    with pytest.raises(ValueError, match="one box with these sides, or 3 cubes"):
+    with pytest.raises(ValueError, match="one box .*or 3 cubes"):
         sweep(box.replace(temperature=jnp.ones(3) * 0.01))
