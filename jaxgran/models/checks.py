@@ -93,7 +93,7 @@ def check_cools(gas: Gas) -> None:
             "impacts in this gas, but eps must be a number >= 0: limit it, as in "
             "jnp.clip(eps, 0.0, 1.0), or lower T_0"
         )
-    if not scales.cooling_rate >= 0:
+    if scales.cooling_rate < 0:
         raise ValueError(
             "the law of restitution makes this gas heat up: its mean eps over impacts is above 1 "
             "(a truncated series beyond its range). Lower T_0 or A, or use another law."
