@@ -306,8 +306,8 @@ def _runs(
 ) -> tuple[list[Int[Array, "n"]], list[Int[Array, "n"]]]:
     """Return the runs with which each sorted particle is compared: first slots and lengths.
 
-    In its own row a run is that of the following particles. The neighbouring rows are half of all,
-    so that each pair of rows occurs once.
+    In its own row a particle is compared with the following ones. The neighbouring rows are half of
+    all, so that each pair of rows occurs once.
 
     Args:
         grid: the cells.

@@ -167,8 +167,8 @@ ENGINES = ("auto", "sweep", "cells", "jax-md")
 device; "auto" is the fastest of them."""
 
 MAX_LOOKAHEAD = 450
-"""Expected look-ahead, in particles, up to which a sweep is as fast as cells. It is that of some
-5000 spheres."""
+"""Expected look-ahead, in particles, up to which a sweep is as fast as cells: some
+5000 spheres have it."""
 
 
 class Pairs(NamedTuple):
