@@ -17,9 +17,9 @@ import scipy
 from jaxtyping import Float
 
 from jaxgran.data.measurement import START_TIME
+from jaxgran.fitting.comparison import FLOOR, WHITE
 from jaxgran.fitting.goodness import SIGNIFICANCE, goodness
 from jaxgran.fitting.parameters import as_floats, with_parameters
-from jaxgran.fitting.prediction import FLOOR, WHITE
 from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.rows import CurveRows
 from jaxgran.fitting.search import Minimum, minimise, newton_step

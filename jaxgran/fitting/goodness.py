@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from jaxgran.fitting.prediction import Residuals
+from jaxgran.fitting.comparison import Residuals
 from jaxgran.fitting.problem import Evaluation, Problem
 from jaxgran.fitting.rows import SCATTER
 

@@ -99,6 +99,23 @@ class Nodes(NamedTuple):
     by_size_ratio: Any = None
 
 
+class Innovations(NamedTuple):
+    """Residuals of measured values minus what is expected from all values before them.
+
+    In their first form all arrays have the shape (nodes, 2, gases).
+
+    Attributes:
+        values: innovations of T and of T_rot, relative; 0 where nothing is used.
+        variances: of them.
+        density_changes: what -2 ln L gains where T is compared in place of ln T
+            (`log_density_change`).
+    """
+
+    values: Any
+    variances: Any
+    density_changes: Any
+
+
 def log_ratio(values: Array, log_computed: Array, errors: Array) -> Array:
     """Return the residual of a measured value, relative to the computed one.
 
@@ -146,11 +163,8 @@ def innovations(
     sensitivity: Float[Array, "nodes gases"],
     observed: Observed,
     noise: Noise,
-) -> tuple[
-    Float[Array, "nodes 2 gases"], Float[Array, "nodes 2 gases"], Float[Array, "nodes 2 gases"]
-]:
-    """Return the innovations of a measured curve about some gases, their variances, and what
-    -2 ln L gains where T is compared in place of ln T (`log_density_change`).
+) -> Innovations:
+    """Return the innovations of a measured curve about some gases.
 
     Args:
         gas: neighbouring scenes: its floats have an axis (gases,).
@@ -168,7 +182,7 @@ def innovations(
     found, spread = filtered(
         gas, nodes, residuals[:, :, None], variances, sensitivity, observed.used, noise
     )
-    return found[:, :, 0], spread, log_density_change(values, log_computed, errors)
+    return Innovations(found[:, :, 0], spread, log_density_change(values, log_computed, errors))
 
 
 def filtered(

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from jaxgran._utils.validation import Domain
 from jaxgran.data.measurement import START_TIME, Priors
+from jaxgran.fitting.comparison import Comparison, Residuals
 from jaxgran.fitting.parameters import (
     SHARED,
     Unknown,
@@ -19,13 +20,7 @@ from jaxgran.fitting.parameters import (
     prior_residuals,
     residuals_and_slopes,
 )
-from jaxgran.fitting.prediction import (
-    Element,
-    PredictedCurve,
-    Residuals,
-    predicted_curve,
-    steady_curve,
-)
+from jaxgran.fitting.prediction import Element, PredictedCurve, predicted_curve, steady_curve
 from jaxgran.fitting.rows import CurveRows, DropRows
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import Gas
@@ -201,7 +196,7 @@ class Problem:
 
         Args:
             flat: the unknowns, in their unconstrained scale.
-            sources: factors of variances, see `jaxgran.fitting.prediction.PredictedCurve`.
+            sources: factors of variances, see `jaxgran.fitting.comparison.Comparison`.
         """
         key = flat.tobytes() + repr(sources).encode()
         if key not in self._last:
@@ -230,7 +225,7 @@ class Problem:
                 rows[-1] = rows[-1]._replace(log_variance=2 * np.log(widening))
                 continue
             curve = self._curve(m, flat, own, elements)
-            rows += curve.residuals(len(elements), **sources)
+            rows += Comparison(curve, sources).residuals(len(elements))
             curves[m.label] = curve.fields
             for name, error in m.nuisances.items():
                 row = np.atleast_1d(own[name]) / error
@@ -252,7 +247,7 @@ class Problem:
             curve = predicted_curve(
                 m, model, values[m.label], applied, self.tolerance, steady_curve
             )
-            curve.residuals(len(elements))
+            Comparison(curve).residuals(len(elements))
 
     def _curve(
         self, m: CurveRows, flat: np.ndarray, values: dict[str, Any], elements: list[Element]

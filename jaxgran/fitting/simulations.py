@@ -22,6 +22,7 @@ from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.data.curve import CoolingCurve, Run
 from jaxgran.data.measurement import Measurement
 from jaxgran.fitting.alternatives import Explanations, compare_alternatives
+from jaxgran.fitting.comparison import Comparison, Residuals
 from jaxgran.fitting.estimate import (
     describe_gas,
     fit_without_noise,
@@ -46,7 +47,7 @@ from jaxgran.fitting.parameters import (
     prior_residuals,
     with_parameters,
 )
-from jaxgran.fitting.prediction import PredictedCurve, Residuals, predicted_curve
+from jaxgran.fitting.prediction import predicted_curve
 from jaxgran.fitting.problem import Problem, summed
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.rows import CurveRows, curve_rows, with_rate_error
@@ -115,7 +116,7 @@ class Average(NamedTuple):
         noise: covariance of the mean by the noise of the simulations.
         residuals: of unit variance, at the mean.
         sensitivity: their derivatives.
-        curve: the measurement beside kinetic theory, with the noise of the simulations.
+        comparison: of kinetic theory with the measurement, with the noise of the simulations.
     """
 
     flat: Float[np.ndarray, "p"]
@@ -123,7 +124,7 @@ class Average(NamedTuple):
     noise: Float[np.ndarray, "p p"]
     residuals: Float[np.ndarray, "values"]
     sensitivity: Float[np.ndarray, "values p"]
-    curve: PredictedCurve
+    comparison: Comparison
 
 
 @dataclass(frozen=True)
@@ -203,18 +204,18 @@ class Simulations:
         )
         return simulation, curve
 
-    def beside_theory(self, flat: np.ndarray, variance: np.ndarray) -> PredictedCurve:
+    def beside_theory(self, flat: np.ndarray, variance: np.ndarray) -> Comparison:
         """Return the measurement beside kinetic theory, with a variance of the simulations."""
         floats = self.problem.values(flat)[""]
         known = {name: x for name, x in floats.items() if name in self.theory.gas.domains}
         rows = replace(self.theory, simulation=variance.reshape(2, -1).T)
-        return predicted_curve(rows, KineticTheory(), known, [])
+        return Comparison(predicted_curve(rows, KineticTheory(), known, []))
 
     def average(self, near: list[Simulation]) -> Average:
         """Return the mean of the Gauss-Newton estimates of some simulations, the newest last."""
         resolution = self.model.derivative_accuracy
         variance = np.mean([s.variance for s in near], axis=0) / len(near)
-        curve = self.beside_theory(near[-1].flat, variance)
+        comparison = self.beside_theory(near[-1].flat, variance)
         estimates = []
         noises = []
         p = near[-1].flat.size
@@ -227,7 +228,7 @@ class Simulations:
             if len(near) > 1:
                 slope = slopes + (slopes - s.slope) / (len(near) - 1)
             columns = np.concatenate([difference[:, None], slope, s.deviation.T], axis=1)
-            columns = curve.whiten(columns)
+            columns = comparison.whiten(columns)
             gain = np.linalg.pinv(columns[:, 1 : 1 + p], rcond=resolution)
             estimates.append(s.flat + gain @ columns[:, 0])
             replicas = len(s.deviation)
@@ -236,11 +237,11 @@ class Simulations:
         flat = np.mean(estimates, axis=0)
         differences = [self.measured - s.values - s.slope @ (flat - s.flat) for s in near]
         columns = np.concatenate([np.mean(differences, axis=0)[:, None], slopes], axis=1)
-        columns = curve.whiten(columns)
+        columns = comparison.whiten(columns)
         sensitivity = columns[:, 1:]
         information = sensitivity.T @ sensitivity
         noise = np.mean(noises, axis=0) / len(near)
-        return Average(flat, information, noise, columns[:, 0], sensitivity, curve)
+        return Average(flat, information, noise, columns[:, 0], sensitivity, comparison)
 
 
 def variance_of_mean(deviation: Float[np.ndarray, "replicas used"]) -> Float[np.ndarray, "used"]:
@@ -424,8 +425,8 @@ def _result(
     differences = [sims.measured - s.values - s.slope @ (flat - s.flat) for s in search.near]
     slopes = np.mean([s.slope for s in search.near], axis=0)
     columns = np.concatenate([np.mean(differences, axis=0)[:, None], slopes], axis=1)
-    curve = average.curve
-    whitened = curve.whiten(columns)
+    comparison = average.comparison
+    whitened = comparison.whiten(columns)
     residuals = whitened[:, 0]
     sensitivity = whitened[:, 1:]
     number = int(np.sum(sims.rows.used))
@@ -441,7 +442,7 @@ def _result(
     to_si = scale * covariance
 
     def linear(**sources: float) -> np.ndarray:
-        rows = curve.whiten(slopes, **sources)
+        rows = replace(comparison, sources=sources).whiten(slopes)
         return rows.T @ rows / ratio
 
     covariances = {}
@@ -455,7 +456,7 @@ def _result(
     priors = {k: x for k, x in request.priors.get("", {}).items() if k != SMOOTHNESS}
     gas = with_parameters(sims.rows.scene, as_jax_arrays(as_floats(problem.values(flat)[""])))
     for name, change in prior_effects(gas, priors, search.curve, sims.rows.uses_rotation).items():
-        moved = to_si @ sensitivity.T @ (curve.whiten(change) / ratio**0.5)
+        moved = to_si @ sensitivity.T @ (comparison.whiten(change) / ratio**0.5)
         covariances[name] = moved @ moved.T
     extrapolation = scale[:, 0] * (flat - np.mean([s.flat for s in search.near], axis=0))
     bias = derivative_bias(sims, search, gas, sensitivity)

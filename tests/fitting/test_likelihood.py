@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxgran
+from jaxgran.fitting.comparison import Comparison
 from jaxgran.fitting.likelihood import SAMPLE_MEMORY, Nodes, filtered
 from jaxgran.fitting.prediction import predicted_curve
 from jaxgran.fitting.rows import Noise, curve_rows
@@ -56,7 +57,7 @@ def test_the_filter_is_the_dense_covariance(name):
     measurement = jaxgran.Measurement(gas, curve, **known)
     rows, _ = curve_rows("", measurement, THEORY, fits_T_0=False, fits_t0=False)
     rows = dataclasses.replace(rows, faster=1.0)
-    (row,) = predicted_curve(rows, THEORY, {}, []).residuals(0)
+    (row,) = Comparison(predicted_curve(rows, THEORY, {}, [])).residuals(0)
     found = np.sum(row.values**2) + np.sum(row.log_variance)
     log_determinant = np.linalg.slogdet(covariance)[1]
     expected = residuals @ np.linalg.solve(covariance, residuals) + log_determinant

@@ -1,0 +1,243 @@
+"""A measured curve compared with its prediction: independent residuals and their derivatives.
+
+The innovations of a curve (`jaxgran.fitting.likelihood`) depend on the unknowns through the
+predicted curve and through the scatter of N grains. They are differentiated by central differences
+along the tangents of the prediction: one call for all unknowns, by a program of its own.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxgran._utils.tracing import fast_jit
+from jaxgran.fitting.likelihood import Innovations, Nodes, filtered, innovations
+from jaxgran.fitting.parameters import with_parameters
+from jaxgran.fitting.prediction import Element, PredictedCurve, Prediction
+from jaxgran.fitting.rows import DISPLACEMENT, Displacement, Noise, Observed
+from jaxgran.scene.gas import Gas
+
+FLOOR = "floor"
+"""Noise floor, m^2/s^2, added to the computed T: a parameter of an alternative explanation."""
+
+WHITE = "white"
+"""Relative standard deviation of further independent errors of T: another one."""
+
+DIFFERENCE = float(np.finfo(float).eps ** 0.25)
+"""Step of central differences in an unconstrained parameter."""
+
+
+class Residuals(NamedTuple):
+    """Independent Gaussian residuals, with their derivatives in all unknowns.
+
+    Attributes:
+        name: what they belong to: "curve", "displacement", "drop test", or the name of a prior or
+            of a nuisance parameter.
+        label: of the measurement; None for priors of shared parameters.
+        values: over their standard deviation, shape (n,); 0 where nothing was measured.
+        slopes: derivatives at fixed standard deviations, shape (n, unknowns).
+        log_variance: logarithm of their variances, shape (n,).
+        log_slopes: its derivatives, shape (n, unknowns).
+        is_prior: whether they are of prior knowledge.
+    """
+
+    name: str
+    label: str | None
+    values: Float[np.ndarray, "n"]
+    slopes: Float[np.ndarray, "n unknowns"]
+    log_variance: Float[np.ndarray, "n"]
+    log_slopes: Float[np.ndarray, "n unknowns"]
+    is_prior: bool = False
+
+    @property
+    def information(self) -> Float[np.ndarray, "unknowns unknowns"]:
+        """Half of the expected second derivatives of -2 ln L."""
+        return self.slopes.T @ self.slopes + 0.5 * self.log_slopes.T @ self.log_slopes
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A predicted curve and the measured one.
+
+    Attributes:
+        curve: the predicted curve, with the measurement.
+        sources: factors of the variances by "measurement", "few particles", "model" and
+            "simulation"; 1 by default.
+    """
+
+    curve: PredictedCurve
+    sources: dict[str, float] = field(default_factory=dict)
+
+    @np.errstate(divide="ignore", invalid="ignore", over="ignore")
+    def residuals(self, size: int) -> list[Residuals]:
+        """Return the residuals, with derivatives in all of `size` unknowns."""
+        curve = self.curve
+        rows = [self._of_temperatures(size)]
+        if curve.rows.displacement is not None:
+            rows.append(_of_displacement(curve, curve.rows.displacement, size))
+        return rows
+
+    def whiten(
+        self, columns: Float[np.ndarray, "values columns"]
+    ) -> Float[np.ndarray, "values columns"]:
+        """Return columns of residuals as independent ones of unit variance.
+
+        Args:
+            columns: of ln T at all times, followed by ln T_rot.
+        """
+        curve = self.curve
+        count = columns.shape[1]
+        at_nodes = np.zeros((curve.times.size, 2, count))
+        at_nodes[curve.place] = columns.reshape(2, -1, count).swapaxes(0, 1)
+        observed = self._observed()
+        errors = observed.errors / np.exp(curve.prediction.compared)
+        variances = errors**2 + observed.simulation
+        # The one gas is the last axis of all arrays, and the first one of its parameters.
+        prediction = jax.tree.map(lambda x: np.asarray(x)[..., None], curve.prediction)
+        gas = jax.tree.map(lambda x: np.asarray(x)[None], curve.gas)
+        compiled = fast_jit(filtered, jax.default_backend())
+        found = compiled(
+            gas,
+            _nodes(curve, prediction, curve.gas),
+            at_nodes[..., None],
+            variances[..., None],
+            np.ones((curve.times.size, 1)),
+            observed.used,
+            self._noise(prediction.scatter),
+        )
+        values, spread = (np.asarray(x)[curve.place, ..., 0] for x in found)
+        values = values / np.sqrt(spread)[..., None]
+        return values.swapaxes(0, 1).reshape(-1, count)
+
+    def _of_temperatures(self, size: int) -> Residuals:
+        """Return the residuals of T, followed by those of T_rot."""
+        moving = _elements_of_temperatures(self.curve)
+        found = self._at_neighbours([tangent for _, tangent in moving])
+        values = found.values
+        variances = found.variances
+        changes = found.density_changes
+        error = np.sqrt(variances[0])
+        whitened = values[0] / error
+        slopes = np.zeros((whitened.size, size))
+        log_slopes = np.zeros((whitened.size, size))
+        for k, (element, _) in enumerate(moving):
+            up = 1 + 2 * k
+            down = 2 + 2 * k
+            of_value = (values[up] - values[down]) / (2 * DIFFERENCE)
+            of_log_variance = np.log(variances[up] / variances[down]) / (2 * DIFFERENCE)
+            of_change = (changes[up] - changes[down]) / (2 * DIFFERENCE)
+            # Where T is compared, slopes become those of (y - T)/error, and log_slopes 0.
+            slopes[:, element.place] = of_value / error + 0.5 * whitened * of_change
+            log_slopes[:, element.place] = of_log_variance + of_change
+        log_variance = np.log(variances[0]) + changes[0]
+        label = self.curve.rows.label
+        return Residuals("curve", label, whitened, slopes, log_variance, log_slopes)
+
+    def _at_neighbours(self, tangents: list[Prediction]) -> Innovations:
+        """Return innovations at the unknowns, and a step up and a step down along each tangent.
+
+        The shapes are (1 + 2 tangents, 2 times): those of T are followed by those of T_rot.
+        """
+        curve = self.curve
+        count = 1 + 2 * len(tangents)
+        gases = _batch_size(count)
+        steps = np.zeros((len(tangents), gases))
+        for k in range(len(tangents)):
+            steps[k, 1 + 2 * k] = DIFFERENCE
+            steps[k, 2 + 2 * k] = -DIFFERENCE
+
+        def with_neighbours(x: Any, *tangents: Any) -> np.ndarray:
+            slopes = np.stack([np.zeros_like(x), *tangents], axis=-1)[..., 1:]
+            return np.asarray(x)[..., None] + slopes @ steps
+
+        batch: Prediction = jax.tree.map(with_neighbours, curve.prediction, *tangents)
+        floor = float(curve.values.get(FLOOR, 0.0))
+        T = np.exp(batch.compared[:, 0])
+        compared = batch.compared.copy()
+        compared[:, 0] = np.log(T + floor)
+        gas = jax.tree.map(lambda x: np.broadcast_to(x, (gases, *np.shape(x))), curve.gas)
+        gas = with_parameters(
+            gas, {name: np.moveaxis(x, -1, 0) for name, x in batch.parameters.items()}
+        )
+        compiled = fast_jit(innovations, jax.default_backend())
+        found = compiled(
+            gas,
+            _nodes(curve, batch, gas),
+            compared,
+            T / (T + floor),
+            self._observed(),
+            self._noise(batch.scatter),
+        )
+
+        def of_data(x: Any) -> np.ndarray:
+            return np.asarray(x)[curve.place, :, :count].transpose(2, 1, 0).reshape(count, -1)
+
+        used = curve.rows.used.T.ravel() > 0
+        return Innovations(
+            of_data(found.values),
+            np.where(used, of_data(found.variances), 1.0),
+            np.where(used, of_data(found.density_changes), 0.0),
+        )
+
+    def _observed(self) -> Observed:
+        curve = self.curve
+        factor = self.sources.get("measurement", 1.0) ** 0.5
+        observed = curve.rows.at_nodes(curve.times.size, curve.place, factor)
+        simulation = self.sources.get("simulation", 1.0) * observed.simulation
+        return observed._replace(simulation=simulation)
+
+    def _noise(self, log_scatter: Any) -> Noise:
+        curve = self.curve
+        few_particles = self.sources.get("few particles", 1.0)
+        scatter = few_particles * curve.rows.scatter * np.exp(log_scatter)
+        white = float(curve.values.get(WHITE, 0.0))
+        factor = self.sources.get("model", 1.0) ** 0.5
+        return curve.rows.noise(curve.times, scatter, white, factor)
+
+
+def _nodes(curve: PredictedCurve, batch: Prediction, gas: Gas) -> Nodes:
+    """Return predictions of some gases, which are the last axis of `batch`, as nodes."""
+    return Nodes(
+        curve.times,
+        batch.log_T,
+        batch.rotation,
+        curve.sonine,
+        batch.collisions,
+        batch.size_ratio,
+        curve.by_size_ratio(gas, batch.size_ratio),
+    )
+
+
+def _elements_of_temperatures(curve: PredictedCurve) -> list[tuple[Element, Prediction]]:
+    """Return the unknowns on which T and T_rot depend, with their tangents."""
+    pairs = zip(curve.elements, curve.tangents, strict=True)
+    return [(element, tangent) for element, tangent in pairs if element.name != DISPLACEMENT]
+
+
+def _of_displacement(curve: PredictedCurve, measured: Displacement, size: int) -> Residuals:
+    """Return the residuals of <dr^2>."""
+    collisions = curve.prediction.collisions[curve.place]
+    # The common factor is one of D: the ballistic flight before collisions has no error.
+    diffusive = collisions / (1 + collisions)
+    factor = curve.values.get(DISPLACEMENT, 0.0)
+    computed = curve.prediction.displacement[curve.place] + factor * diffusive
+    used = measured.errors > 0
+    errors = np.where(used, measured.errors, 1.0)
+    logs = np.log(np.where(used, measured.values, 1.0))
+    values = np.where(used, (logs - computed) / errors, 0.0)
+    slopes = np.zeros((values.size, size))
+    for element, tangent in zip(curve.elements, curve.tangents, strict=True):
+        change = tangent.displacement[curve.place]
+        if element.name == DISPLACEMENT:
+            change = diffusive * element.slope
+        slopes[:, element.place] = np.where(used, -change / errors, 0.0)
+    log_variance = np.zeros(values.size)
+    log_slopes = np.zeros_like(slopes)
+    return Residuals("displacement", curve.rows.label, values, slopes, log_variance, log_slopes)
+
+
+def _batch_size(count: int) -> int:
+    """Return the smallest of 8, 16, 32, ... that is >= `count`, so that few sizes are compiled."""
+    return max(8, 1 << (count - 1).bit_length())
