@@ -22,7 +22,7 @@ from jaxgran.fitting.rows import CurveRows, DropRows, curve_rows, with_rate_erro
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import Gas
 
-OF_CURVES = ("dissipative_constant", "coefficient")
+GUESSED_FROM_CURVES = ("dissipative_constant", "coefficient")
 """Parameters that curves guess better than drop tests."""
 
 
@@ -50,58 +50,90 @@ class Request:
     absent: tuple[str, ...]
     quick: bool
 
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Names of all free parameters."""
+        return (*self.names, *self.separate)
+
+    @property
+    def has_prior_of_t0(self) -> bool:
+        """Whether t0 of some measurement has a prior."""
+        return any(START_TIME in some for some in self.priors.values())
+
 
 def build_problem(request: Request) -> tuple[Problem, np.ndarray, list[str]]:
     """Return the problem of a fit, a first guess of its unknowns, and notes on the data."""
-    model = request.model
-    free = (*request.names, *request.separate)
-    prior_names = {name for some in request.priors.values() for name in some}
-    fits_t0 = START_TIME in (*free, *prior_names)
-    measurements: list[CurveRows | DropRows] = []
-    guesses: dict[str, Gas] = {}
-    of_impacts: dict[str, Any] = {}
-    notes: list[str] = []
-    for label, m in request.measurements.items():
-        if isinstance(m.data, DropTest):
-            measurements.append(DropRows(label, m))
-            values = guess_from_drops(m.gas, m.data, free)
-            guesses[label] = m.gas.replace(**values)
-            of_impacts |= {name: x for name, x in values.items() if name not in OF_CURVES}
-            continue
-        model.check_scene(m.gas if request.start is None else request.start)
-        rows, more = curve_rows(label, m, model, fits_T_0="temperature" in free, fits_t0=fits_t0)
-        notes += [f"{label}: {note}" if label else note for note in more]
-        clocks = (START_TIME,) if START_TIME in prior_names else ()
-        since = m.curve
-        if "temperature" in free:
-            known = known_start_time(request.priors, label)[0]
-            since = replace(since, times=np.asarray(since.times) - np.asarray(known))
-        guesses[label] = guess_from_data(rows.gas, since, (*free, *clocks))
-        measurements.append(rows)
-    problem = Problem.build(
-        tuple(measurements), model, request.names, request.separate, request.priors
-    )
-    # Drop tests start from the values of the first curve.
-    for m in measurements:
-        if isinstance(m, DropRows) and problem.curves:
-            shared = guesses[problem.curves[0].label]
-            guesses[m.label] = with_values_of(m.gas, shared, request.names)
-    # Parameters that impacts alone determine start from the drop tests.
-    for label, gas in guesses.items():
-        guesses[label] = gas.replace(**{n: x for n, x in of_impacts.items() if n in gas.domains})
+    rows, notes = _rows(request)
+    problem = Problem.build(rows, request.model, request.names, request.separate, request.priors)
+    guesses = _guesses(request, problem)
     first = problem.flat(_values_of_guesses(problem, guesses))
     with ThreadPoolExecutor(1) as thread:  # two programs are compiled at the same time
         compiled = thread.submit(_compile_innovations, problem, first, *_configuration())
         problem = problem_with_rate_errors(problem, first)
         compiled.result()
     if request.start is not None:
-        complete = {
-            label: with_values_of(guess, request.start, free) for label, guess in guesses.items()
+        started = {
+            label: with_values_of(guess, request.start, request.free)
+            for label, guess in guesses.items()
         }
-        other = problem.flat(_values_of_guesses(problem, complete))
-        starts = [(problem.evaluate(flat).value, flat) for flat in (first, other)]
-        first = min(starts, key=lambda pair: (np.isnan(pair[0]), pair[0]))[1]
+        first = _better(problem, first, problem.flat(_values_of_guesses(problem, started)))
     return problem, first, notes
+
+
+def _rows(request: Request) -> tuple[tuple[CurveRows | DropRows, ...], list[str]]:
+    """Return the measurements as they are compared with the model, and notes on the data."""
+    found: list[CurveRows | DropRows] = []
+    notes: list[str] = []
+    fits_T_0 = "temperature" in request.free
+    fits_t0 = START_TIME in request.free or request.has_prior_of_t0
+    for label, m in request.measurements.items():
+        if isinstance(m.data, DropTest):
+            found.append(DropRows(label, m))
+            continue
+        request.model.check_scene(m.gas if request.start is None else request.start)
+        rows, of_rows = curve_rows(label, m, request.model, fits_T_0=fits_T_0, fits_t0=fits_t0)
+        found.append(rows)
+        notes += [f"{label}: {note}" if label else note for note in of_rows]
+    return tuple(found), notes
+
+
+def _guesses(request: Request, problem: Problem) -> dict[str, Gas]:
+    """Return the gas of each measurement with guesses of its free parameters."""
+    curves = {m.label: _guess_of_curve(request, m) for m in problem.curves}
+    drops = [m for m in problem.measurements if isinstance(m, DropRows)]
+    of_drops = {m.label: guess_from_drops(m.scene, m.data, request.free) for m in drops}
+    guesses: dict[str, Gas] = {}
+    for m in problem.measurements:
+        if isinstance(m, CurveRows):
+            guesses[m.label] = curves[m.label]
+        elif curves:
+            of_first_curve = curves[problem.curves[0].label]
+            guesses[m.label] = with_values_of(m.gas, of_first_curve, request.names)
+        else:
+            guesses[m.label] = m.scene.replace(**of_drops[m.label])
+    # What impacts tell better than curves starts from the last drop test.
+    known = {name: x for some in of_drops.values() for name, x in some.items()}
+    better = {name: x for name, x in known.items() if name not in GUESSED_FROM_CURVES}
+    for label, gas in guesses.items():
+        own = {name: x for name, x in better.items() if name in gas.domains}
+        guesses[label] = gas.replace(**own)
+    return guesses
+
+
+def _guess_of_curve(request: Request, rows: CurveRows) -> Gas:
+    """Return the gas of a measured curve with guesses of its free parameters."""
+    curve = rows.curve
+    if "temperature" in request.free:
+        t0, _ = known_start_time(request.priors, rows.label)
+        curve = replace(curve, times=np.asarray(curve.times) - np.asarray(t0))
+    clock = (START_TIME,) if request.has_prior_of_t0 else ()
+    return guess_from_data(rows.gas, curve, (*request.free, *clock))
+
+
+def _better(problem: Problem, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the unknowns of lower -2 ln L, the first ones if both cannot be computed."""
+    starts = [(problem.evaluate(flat).value, flat) for flat in (first, second)]
+    return min(starts, key=lambda pair: (np.isnan(pair[0]), pair[0]))[1]
 
 
 def _configuration() -> tuple[bool, Any]:

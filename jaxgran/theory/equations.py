@@ -200,6 +200,13 @@ class Equations(NamedTuple):
             names.append("size_ratio")
         return names
 
+    @property
+    def controlling(self) -> Any:
+        """Index of the moments whose errors control the steps; all others follow them."""
+        if self.sizes:
+            return np.array([0, 1, 2, self.names.index("size_ratio")])
+        return slice(5 if self.spreading else 3)
+
     def moments(self, values: Float[Array, "moments ..."]) -> Moments:
         """Return the moments held by the rows of an array."""
         names = [*self.names, *Moments._fields[7:10]]

@@ -42,10 +42,45 @@ def padded_length(size: int) -> int:
     return WINDOW * 2 ** max(0, (size - 1) // WINDOW).bit_length()
 
 
+class _Progress(NamedTuple):
+    """Progress of an integration.
+
+    Attributes:
+        time: reached by the accepted steps.
+        state: y at this time.
+        values: y at the output times, shape (times, ...); those not reached have any value.
+        num_known: number of output times that are reached.
+        num_steps: number of steps tried.
+        step_end: end of the next step.
+        solver_state, control: states of the solver and of the controller of the steps.
+    """
+
+    time: Float[Array, ""]
+    state: Array
+    values: Array
+    num_known: Int[Array, ""]
+    num_steps: Int[Array, ""]
+    step_end: Float[Array, ""]
+    solver_state: Any
+    control: Any
+
+
 def _fill_values(
-    evaluate: Callable[[Array], Array], times: Array, reached: Array, values: Array, known: Array
-) -> tuple[Array, Int[Array, ""]]:
-    """Values with those up to a reached time filled in, and the number of known ones."""
+    evaluate: Callable[[Array], Array],
+    times: Float[Array, "times"],
+    reached: Float[Array, ""],
+    values: Float[Array, "times ..."],
+    known: Int[Array, ""],
+) -> tuple[Float[Array, "times ..."], Int[Array, ""]]:
+    """Return values at the output times, filled in up to a reached time, and how many are known.
+
+    Args:
+        evaluate: returns the value at a time of the last step.
+        times: of the output.
+        reached: end of the last step; -1 if it was rejected.
+        values: known before this step.
+        known: number of these.
+    """
 
     window = min(WINDOW, times.size)
 
@@ -91,7 +126,8 @@ def integrate_at(
 
     Returns:
         The states at those times, and whether the last time was reached within that number of
-        steps; nan where the solver failed otherwise.
+        steps. Otherwise the states at the times that were not reached mean nothing: they are
+        y(0), or nan where diffrax ran the solver and failed.
     """
     term = diffrax.ODETerm(lambda t, y, args: vector_field(t, y))
     if not isinstance(solver, diffrax.AbstractERK):
@@ -118,45 +154,60 @@ def integrate_at(
 
     last = times[-1]
     order: Any = solver.error_order(term)
-    zero, first = jnp.zeros((), times.dtype), jnp.asarray(FIRST_STEP, times.dtype)
+    zero = jnp.zeros((), times.dtype)
+    first = jnp.asarray(FIRST_STEP, times.dtype)
     end, control = controller.init(term, zero, last, start, first, None, solver.func, order)
     end = jnp.minimum(jnp.asarray(end), last)
     solver_state = solver.init(term, zero, end, start, None)
     # As arrays, so that their types do not change from step to step.
     solver_state, control = jax.tree.map(jnp.asarray, (solver_state, control))
-    values = jnp.broadcast_to(start, (times.size, *start.shape))
-    none = jnp.zeros((), int)
-    # The state before the next step, the output values, how many of these are known, the number of
-    # steps made, the end of the next step, and the states of the solver and the controller.
-    first_step = zero, start, values, none, none, end, solver_state, control
+    begun = _Progress(
+        time=zero,
+        state=start,
+        values=jnp.broadcast_to(start, (times.size, *start.shape)),
+        num_known=jnp.zeros((), int),
+        num_steps=jnp.zeros((), int),
+        step_end=end,
+        solver_state=solver_state,
+        control=control,
+    )
 
-    def unfinished(now: tuple) -> Array:
-        t, _, _, _, steps, *_ = now
-        return (t < last) & (steps < max_steps)
+    def is_unfinished(now: _Progress) -> Bool[Array, ""]:
+        return (now.time < last) & (now.num_steps < max_steps)
 
-    def step(now: tuple) -> tuple:
-        begin, y, values, known, steps, end, solver_state, control = now
-        new_y, error, dense, new_solver_state, _ = solver.step(
-            term, begin, end, y, None, solver_state, False
+    def step(now: _Progress) -> _Progress:
+        begin = now.time
+        end = now.step_end
+        state, error, dense, solver_state, _ = solver.step(
+            term, begin, end, now.state, None, now.solver_state, False
         )
         # An infinite error makes the controller repeat the step with a shorter one.
         error = jnp.where(jnp.isnan(error), jnp.inf, error)
-        accepted, t, next_end, _, control, _ = controller.adapt_step_size(
-            begin, end, y, new_y, None, error, order, control
+        accepted, time, step_end, _, control, _ = controller.adapt_step_size(
+            begin, end, now.state, state, None, error, order, now.control
         )
         piece = solver.interpolation_cls(t0=begin, t1=end, **dense)
         reached = jnp.where(accepted, end, -1.0)
-        values, known = _fill_values(piece.evaluate, times, reached, values, known)
-        y, solver_state = jax.tree.map(
-            partial(jnp.where, accepted), (new_y, new_solver_state), (y, solver_state)
+        values, known = _fill_values(piece.evaluate, times, reached, now.values, now.num_known)
+        state, solver_state = jax.tree.map(
+            partial(jnp.where, accepted), (state, solver_state), (now.state, now.solver_state)
         )
         # Avoid a very short last step.
-        next_end = jnp.where(next_end > last - 1e-3 * (next_end - t), last, next_end)
+        step_end = jnp.where(step_end > last - 1e-3 * (step_end - time), last, step_end)
         control = jax.tree.map(jnp.asarray, control)
-        return jnp.asarray(t), y, values, known, steps + 1, next_end, solver_state, control
+        return _Progress(
+            jnp.asarray(time),
+            state,
+            values,
+            known,
+            now.num_steps + 1,
+            step_end,
+            solver_state,
+            control,
+        )
 
-    t, _, values, *_ = jax.lax.while_loop(unfinished, step, first_step)
-    return values, t >= last
+    ended = jax.lax.while_loop(is_unfinished, step, begun)
+    return ended.values, ended.time >= last
 
 
 class MomentSolver(NamedTuple):
@@ -194,7 +245,8 @@ class MomentSolver(NamedTuple):
         @jax.custom_jvp
         def solve(leaves: list[Array], times: Array) -> tuple[Moments, Int[Array, ""]]:
             scene = structure.unflatten(leaves)
-            table, start = equations.table(scene, times[-1]), equations.initial(scene, times)
+            table = equations.table(scene, times[-1])
+            start = equations.initial(scene, times)
 
             def derivative(row):
                 return equations.derivative(row, table(row[0]), scene)
@@ -205,7 +257,8 @@ class MomentSolver(NamedTuple):
 
         @partial(solve.defjvp, symbolic_zeros=True)
         def solve_jvp(primals, tangents):
-            (leaves, times), (along, times_along) = primals, tangents
+            leaves, times = primals
+            along, times_along = tangents
             changing = [np.full(x.size, not _is_zero(x)) for x in along]
             units = np.eye(sum(x.size for x in along))
             units = units[np.concatenate([np.zeros(0, bool), *changing])]
@@ -262,6 +315,7 @@ class MomentSolver(NamedTuple):
         leaves = [jnp.asarray(x, dtype) for x in leaves]
         parameters = _ravel(leaves, dtype)
         _, unravel = ravel_pytree(structure.unflatten(leaves))
+        # A function of the parameters: all leaves of the scene, one after the other.
         table, table_along = jax.linearize(
             lambda parameters: equations.table(unravel(parameters), times[-1]), parameters
         )
@@ -297,10 +351,7 @@ class MomentSolver(NamedTuple):
     ) -> tuple[Array, Int[Array, ""]]:
         """Return the rows at the given times, shape (times, rows, states), and a status."""
         dtype = times.dtype
-        equations = self.equations
-        controlling: Any = slice(5 if equations.spreading else 3)
-        if equations.sizes:
-            controlling = np.array([0, 1, 2, len(equations.names) - 1])
+        controlling = self.equations.controlling
         known = jnp.all(jnp.isfinite(parameters)) & jnp.all(jnp.isfinite(times))
         # With nan parameters the state stays constant, so that the solver does not shorten its
         # steps.
