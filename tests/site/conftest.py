@@ -45,8 +45,12 @@ def fresh(wheel, tmp_path_factory):
 def run(fresh, tmp_path):
     """A function that runs a program of the fresh environment in an empty folder."""
     paths = os.pathsep.join([str(fresh), os.environ["PATH"]])
-    bare = {key: x for key, x in os.environ.items() if not key.startswith(("PYTHON", "XLA"))}
+    bare = {key: x for key, x in os.environ.items() if not key.startswith("PYTHON")}
     bare["PATH"] = paths
+    # Programs that other tests have compiled are not compiled again.
+    bare["JAX_COMPILATION_CACHE_DIR"] = os.environ["JAXGRAN_TEST_PROGRAMS"]
+    bare["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+    bare["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 
     def run(*arguments, program="python"):
         command = [str(fresh / program), *map(str, arguments)]
