@@ -6,6 +6,9 @@ is varied from 0 until it explains almost the whole curve or the data exclude it
 are fitted again for each amplitude, with the scatter that N grains have in that scene. -2 ln L as a
 function of the amplitude shows whether the data prefer the alternative, or exclude it; otherwise
 the parameters are only as certain as the amplitude.
+
+Where the data prefer an element, the same is done with a second effect beside it: the range then
+allows for one effect more than the data show.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +22,7 @@ from jaxtyping import Float
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.comparison import FLOOR, WHITE
 from jaxgran.fitting.goodness import SIGNIFICANCE, goodness
-from jaxgran.fitting.parameters import as_floats, with_parameters
+from jaxgran.fitting.parameters import Unknown, as_floats, domain_of, with_parameters
 from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.rows import CurveRows
 from jaxgran.fitting.search import Minimum, minimise, newton_step
@@ -116,6 +119,9 @@ DECLARABLE = {
 file."""
 
 
+SCENE_PARAMETERS = tuple(parameter for parameter, _ in DECLARABLE.values())
+"""The parameters of elements of a scene, beside which second effects are tried."""
+
 WALLS_ADDED = "walls that dissipate energy"
 DRAG_ADDED = "linear drag, as in air"
 ROUGHNESS_ADDED = "rough grains without initial rotation"
@@ -168,15 +174,18 @@ class Alternative(NamedTuple):
     Attributes:
         name: description of the added element or error.
         effect: its name in ``absent`` of `jaxgran.Measurement`; "" for an error of the measurement.
+            Of two effects together it is the first one.
         amplitude: the best amplitude: the share of the initial cooling rate (walls, drag) or of
             the lowest computed T (floor), 1 + beta_t, 1/mu or mu (sliding), the relative error,
-            the standard deviation of eps, or the delay of the clock over the cooling time.
+            the standard deviation of eps, or the delay of the clock over the cooling time. Of two
+            effects together it is the amplitude of the second one.
         allowed: the smallest and the largest amplitude that the data allow.
         improvement: decrease of -2 ln L from the fitted law to the best amplitude.
         estimate: estimate of the free parameters at the best amplitude, SI.
         low, high: range of each free parameter over the allowed amplitudes, SI, 95 %.
-        preferred: True if the data prefer this alternative to the fitted law; by chance they
-            prefer any of the alternatives in 1 % of fits.
+        preferred: True if the data prefer this alternative to the fitted law, or two effects
+            together to the first of them; by chance they prefer any of the alternatives in 1 % of
+            fits.
         distinguishable: True if the data allow so little of the alternative that it widens the
             range of the first parameter by less than 10 %.
         error_reduction_needed: factor by which the errors must decrease for that; 1 if it is
@@ -264,25 +273,94 @@ def compare_alternatives(
     if not bases:
         return None
     kinds = [] if is_driven else _kinds(problem, bases[0].flat, absent)
-    profiles = {kind: [_profile(problem, kind, base) for base in bases] for kind in kinds}
-    trials = [
-        trial
-        for kind, found in profiles.items()
-        for profile in found
-        for trial in profile
-        if kind.keeps_A
-    ]
-    best = min([*bases, *trials], key=lambda trial: trial.value)
     significant = float(scipy.stats.chi2.isf(PREFERENCE_LEVEL / max(len(kinds), 1), 1))
     found = problem.evaluate(bases[0].flat)
     if goodness(problem, found)["smooth_p_value"] < SIGNIFICANCE / 2:
         # Such a curve prefers whatever has less noise.
         significant = np.inf
+    profiles = {kind: [_profile(problem, kind, base) for base in bases] for kind in kinds}
+    first = _preferred_element(profiles, bases[0].value - significant)
+    pairs = {} if first is None else _pairs(problem, first, profiles[first], absent)
+    all_profiles = profiles | pairs
+    trials = [t for kind in all_profiles if kind.keeps_A for t in _trials(all_profiles[kind])]
+    best = min([*bases, *trials], key=lambda trial: trial.value)
     summary = _Summary(problem, bases[0], best, significant, noise)
     law = summary.build(None, [[base] for base in bases])
-    alternatives = [summary.build(kind, found, law) for kind, found in profiles.items()]
+    singles = {kind: summary.build(kind, found, law) for kind, found in profiles.items()}
+    alternatives = [*singles.values()]
+    for pair, found in pairs.items():
+        assert first is not None
+        alternatives.append(summary.build(pair, found, singles[first]))
     best_first = sorted(alternatives, key=lambda alternative: -alternative.improvement)
     return Explanations(law, tuple(best_first))
+
+
+def _trials(profiles: list[list[Trial]]) -> list[Trial]:
+    return [trial for profile in profiles for trial in profile]
+
+
+def _preferred_element(profiles: dict[Kind, list[list[Trial]]], limit: float) -> Kind | None:
+    """Return the alternative of least -2 ln L, if it adds an element and is below a limit."""
+    known = [kind for kind in profiles if kind.keeps_A]
+    if not known:
+        return None
+
+    def least(kind: Kind) -> float:
+        return min(trial.value for trial in _trials(profiles[kind]))
+
+    first = min(known, key=least)
+    is_element = first.parameters[0] in SCENE_PARAMETERS
+    return first if is_element and least(first) < limit else None
+
+
+def _pairs(
+    problem: Problem, first: Kind, profiles: list[list[Trial]], absent: tuple[str, ...]
+) -> dict[Kind, list[list[Trial]]]:
+    """Return profiles of second effects beside an element, whose amplitude is an unknown.
+
+    Args:
+        problem, absent: see `compare_alternatives`.
+        first: the element.
+        profiles: of the element alone.
+    """
+    at_best = min(_trials(profiles), key=lambda trial: trial.value)
+    problem, base = _with_free_amplitude(problem, first, at_best)
+    if base is None:
+        return {}
+    found = {}
+    for second in _kinds(problem, base.flat, absent):
+        if second.keeps_A:
+            pair = second._replace(
+                name=f"{first.name}, and {second.name}",
+                parameters=(*first.parameters, *second.parameters),
+            )
+            found[pair] = [_profile(problem, second, base)]
+    return found
+
+
+def _with_free_amplitude(
+    problem: Problem, kind: Kind, at_best: Trial
+) -> tuple[Problem, Trial | None]:
+    """Return the problem with an element whose amplitude is an unknown, and its fit."""
+    name = kind.parameters[0]
+    values = {m.label: dict(kind.values(at_best.amplitude, m.label)) for m in problem.curves}
+    unknowns = [Unknown(name, m.label, (), domain_of(m.gas, name)) for m in problem.curves]
+    start = [u.domain.to_free(values[u.label or ""].pop(name)) for u in unknowns]
+    changed = _with_rate_error(problem, kind.rate_error(at_best.amplitude))
+    both = replace(changed, unknowns=(*problem.unknowns, *unknowns), fixed=values)
+    return both, _trial(both, 0.0, np.append(at_best.flat, start))
+
+
+def _with_rate_error(problem: Problem, error: float) -> Problem:
+    """Return a problem with a larger error of the cooling rate of its model."""
+
+    def widened(m: Any) -> Any:
+        if not isinstance(m, CurveRows):
+            return m
+        times, known = m.rate_error
+        return replace(m, rate_error=(times, known + error))
+
+    return replace(problem, measurements=tuple(widened(m) for m in problem.measurements))
 
 
 class _Summary(NamedTuple):
@@ -295,9 +373,15 @@ class _Summary(NamedTuple):
     noise: Float[np.ndarray, "p"]
 
     def build(
-        self, kind: Kind | None, profiles: list[list[Trial]], law: Alternative | None = None
+        self, kind: Kind | None, profiles: list[list[Trial]], beside: Alternative | None = None
     ) -> Alternative:
-        """Return an alternative from its trials, interpolated between the amplitudes."""
+        """Return an alternative from its trials, interpolated between the amplitudes.
+
+        Args:
+            kind: of the alternative; None for the law itself.
+            profiles: the trials, from each minimum.
+            beside: what it is added to: the law, or an element; None for the law itself.
+        """
         size = self.problem.num_free
         rows = []
         for trials in profiles:
@@ -326,15 +410,17 @@ class _Summary(NamedTuple):
         high = self._in_si(np.max(middle + np.log1p(half + half**2 / 2), axis=0), best)
         estimate = self.problem.estimates(best.flat)
         wider = 0.0
-        if law is not None:
-            wider = max(law.low[0] - low[0], high[0] - law.high[0]) / abs(law.estimate[0])
+        if beside is not None:
+            beyond = max(beside.low[0] - low[0], high[0] - beside.high[0])
+            wider = beyond / abs(beside.estimate[0])
         parameter = "" if kind is None else kind.parameters[0]
         improvement = self.base.value - best.value
+        gained = improvement if beside is None else improvement - beside.improvement
         restitution = None
-        if kind is not None and law is not None and not kind.keeps_A:
+        if kind is not None and beside is not None and not kind.keeps_A:
             wider = 0.0
-            low = law.low
-            high = law.high
+            low = beside.low
+            high = beside.high
             restitution = constant_restitution(self.problem, best)
         return Alternative(
             name="" if kind is None else kind.name,
@@ -345,7 +431,7 @@ class _Summary(NamedTuple):
             estimate=estimate,
             low=low,
             high=high,
-            preferred=bool(improvement > self.significant),
+            preferred=bool(gained > self.significant),
             distinguishable=bool(wider < DISTINGUISHABLE_SHARE),
             error_reduction_needed=float(max(wider / DISTINGUISHABLE_SHARE, 1.0)),
             restitution=restitution,
@@ -523,22 +609,12 @@ def _profile(problem: Problem, kind: Kind, base: Trial) -> list[Trial]:
 
     def fit_with(amplitude: float, first: np.ndarray) -> Trial | None:
         fixed = {
-            m.label: kind.values(amplitude, m.label)
-            if kind.changes_law or isinstance(m, CurveRows)
-            else {}
+            m.label: problem.fixed.get(m.label, {}) | kind.values(amplitude, m.label)
             for m in problem.measurements
+            if kind.changes_law or isinstance(m, CurveRows)
         }
-        error = kind.rate_error(amplitude)
-
-        def with_rate_error(m: Any) -> Any:
-            if not isinstance(m, CurveRows):
-                return m
-            times, known = m.rate_error
-            return replace(m, rate_error=(times, known + error))
-
-        measurements = tuple(with_rate_error(m) for m in problem.measurements)
-        changed = replace(problem, fixed=fixed, measurements=measurements)
-        return _trial(changed, amplitude, first)
+        changed = _with_rate_error(problem, kind.rate_error(amplitude))
+        return _trial(replace(changed, fixed=fixed), amplitude, first)
 
     if not kind.keeps_A:
         trial = fit_with(kind.amplitudes[0][0], base.flat)

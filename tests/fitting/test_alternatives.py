@@ -184,6 +184,31 @@ def test_the_range_holds_A_where_an_element_is_not_told(absent, element, name):
     assert f"known to be absent: {absent}" in told.reasons
 
 
+@pytest.mark.parametrize(
+    "elements, first, second",
+    [
+        ({"container": jaxgran.Walls(0.1, restitution=0.8), "drag": jaxgran.StokesDrag(0.02)},
+         "linear drag, as in air", "walls that dissipate energy"),
+        ({"container": jaxgran.Walls(0.1, restitution=0.8), "surface": jaxgran.Rough(0.4)},
+         "rough grains without initial rotation", "walls that dissipate energy"),
+    ],
+)  # fmt: skip
+def test_the_range_holds_A_where_two_elements_are_not_told(elements, first, second):
+    gas = glass_beads(0.1)
+    # The program of the tests of single elements.
+    other = with_neutral_elements(dataclasses.replace(gas, **elements), jaxgran.KineticTheory())
+    result = without_chance(gas, exact_to(other, 0))
+    by_name = {a.name: a for a in result.alternatives}
+    alone = by_name[first]
+    both = by_name[f"{first}, and {second}"]
+    # The data prefer the first one, with which A is wrong, and do not exclude the second one.
+    assert alone.preferred and not both.preferred
+    assert not alone.low[0] < gas.value(A) < alone.high[0]
+    assert both.low[0] < gas.value(A) < both.high[0] and not both.distinguishable
+    assert both.improvement >= alone.improvement - 3.84 and in_range(result, gas.value(A))
+    assert any(f"{first}, and {second} cannot be excluded" in x for x in result.reasons)
+
+
 def test_a_constant_restitution_is_named_and_A_has_no_meaning_then():
     gas = glass_beads(0.1)
     constant = dataclasses.replace(gas, law=jaxgran.ConstantRestitution(0.9))
