@@ -33,6 +33,7 @@ OPTIONAL_KEYS = (
     "T_scale_err",
     "errors",
     "onto",
+    "eps_scatters",
     "spin_before",
     "T_from",
     *tracks.TRACK_KEYS,

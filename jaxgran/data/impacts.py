@@ -3,6 +3,8 @@
 The names of the columns tell which kind of table it is.
 """
 
+import dataclasses
+
 import numpy as np
 import scipy  # which imports scipy.stats at its first use
 from jaxtyping import Float
@@ -119,7 +121,9 @@ def drop_test_of_table(table: Table) -> tuple[DropTest, list[str]]:
             along u_t, over |u_t|. The header has ``diameter`` where there are spins. Without
             spins, and with the header line ``spin_before: 0``, the velocities of the centres give
             eps_t_center; spheres that rotate before the impact need their spins. The standard
-            error of a component of velocity is v_err, of angular velocity w_err.
+            error of a component of velocity is v_err, of angular velocity w_err. The header line
+            ``eps_scatters: yes`` says that eps differs from impact to impact by more than its
+            errors (`DropTest.scatters`).
 
     Raises:
         ValueError: naming the column and the line of a value out of its range.
@@ -128,8 +132,12 @@ def drop_test_of_table(table: Table) -> tuple[DropTest, list[str]]:
     onto = table.header.get("onto", PARTNERS[0])
     if onto not in PARTNERS:
         raise ValueError(f"header line onto: must be one of {', '.join(PARTNERS)}, got {onto!r}")
+    scatters = table.header.get("eps_scatters", "no")
+    if scatters not in ("yes", "no"):
+        raise ValueError(f"header line eps_scatters: must be yes or no, got {scatters!r}")
     if "vx" in columns:
-        return _of_velocities(table, onto), []
+        test = _of_velocities(table, onto)
+        return dataclasses.replace(test, scatters=scatters == "yes"), []
     _check_column(table, "eps", *EPS_RANGE, "It is the normal speed after over that before.")
     speed = columns["v_n"] if "v_n" in columns else columns["v"]
     name = "v_n" if "v_n" in columns else "v"
@@ -159,6 +167,7 @@ def drop_test_of_table(table: Table) -> tuple[DropTest, list[str]]:
         onto,
         of_centres="eps_t_center" in columns,
         speed_error=speed_error,
+        scatters=scatters == "yes",
         **oblique,
     )
     return test, questions

@@ -80,6 +80,7 @@ MESSAGES = {
     "made A 9 % too small",
     "errors too large": "the residuals are smaller than the errors of T allow by chance: these "
     "errors are too large, or they are common to the points",
+    "scatter of eps": "eps of the impacts scatters by {scatter:.2g} beyond its errors",
     "scatter": "the curve scatters as {number:.3g} +- {error:.2g} grains do",
     "of each": "{label}: chi^2 is {chi2:.3g} for {number} points; its weight in {symbol} is "
     "{weight:.2f}",

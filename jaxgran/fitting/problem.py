@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxgran._utils.validation import Domain
+from jaxgran.data.drop_test import SPHERE
 from jaxgran.data.measurement import START_TIME, Priors
 from jaxgran.fitting.comparison import Comparison, Residuals
 from jaxgran.fitting.parameters import (
@@ -19,6 +20,7 @@ from jaxgran.fitting.parameters import (
     halving_time,
     prior_residuals,
     residuals_and_slopes,
+    with_parameters,
 )
 from jaxgran.fitting.prediction import Element, PredictedCurve, predicted_curve, steady_curve
 from jaxgran.fitting.rows import CurveRows, DropRows
@@ -216,14 +218,12 @@ class Problem:
         for m in self.measurements:
             own = values[m.label]
             if isinstance(m, DropRows):
-                floats = {n: jnp.asarray(x) for n, x in own.items() if n in m.gas.domains}
-                row, slopes = residuals_and_slopes(m.data.residuals, m.gas, floats)
-                row = np.asarray(row)
-                widening = m.widening(floats, row)
-                slopes = {name: x / widening[:, None] for name, x in slopes.items()}
+                row, slopes, widening = _of_impacts(m, own)
                 add("drop test", m.label, row / widening, slopes, is_prior=False)
                 rows[-1] = rows[-1]._replace(log_variance=2 * np.log(widening))
                 continue
+            if "spread" in m.gas.domains:
+                own = {"spread": self.scatter_of_eps(values)} | own
             curve = self._curve(m, flat, own, elements)
             rows += Comparison(curve, sources).residuals(len(elements))
             curves[m.label] = curve.fields
@@ -236,6 +236,24 @@ class Problem:
             for name, (row, slopes) in prior_residuals(priors, gas, values[at]).items():
                 add(name, label or None, row, slopes)
         return summed(rows, curves)
+
+    def scatter_of_eps(self, values: dict[str, dict[str, Any]]) -> float:
+        """Return the standard deviation of eps that impacts of two spheres show; 0 without them.
+
+        Args:
+            values: SI values of the parameters, by label and name.
+        """
+        squares = []
+        numbers = []
+        for m in self.measurements:
+            if not isinstance(m, DropRows) or m.data.onto != SPHERE or not m.data.scatters:
+                continue
+            floats = _floats_of(m, values[m.label])
+            residuals = np.asarray(m.data.residuals(with_parameters(m.gas, floats)))
+            scatter, _ = m.scatter(floats, residuals)
+            squares.append(scatter**2)
+            numbers.append(m.num_points)
+        return float(np.average(squares, weights=numbers) ** 0.5) if squares else 0.0
 
     def compile_innovations(self, flat: np.ndarray) -> None:
         """Compile what an evaluation needs apart from the curves, whatever these are."""
@@ -259,6 +277,21 @@ class Problem:
             curve = predicted_curve(m, self._simplified_model, values, applied, self.tolerance)
             self._curves[m.label] = flat.tobytes(), curve
         return curve
+
+
+def _floats_of(m: DropRows, values: dict[str, Any]) -> dict[str, Any]:
+    return {name: jnp.asarray(x) for name, x in values.items() if name in m.gas.domains}
+
+
+def _of_impacts(
+    m: DropRows, values: dict[str, Any]
+) -> tuple[np.ndarray, dict[str, Any], np.ndarray]:
+    """Return residuals of impacts over their errors, their slopes, and what widens the errors."""
+    floats = _floats_of(m, values)
+    row, slopes = residuals_and_slopes(m.data.residuals, m.gas, floats)
+    row = np.asarray(row)
+    widening = m.widening(floats, row)
+    return row, {name: x / widening[:, None] for name, x in slopes.items()}, widening
 
 
 def _of_unit_variance(

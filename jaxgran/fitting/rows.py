@@ -251,23 +251,40 @@ class DropRows:
         assert isinstance(self.measurement.data, DropTest)
         return self.measurement.data
 
-    def widening(self, values: dict[str, Any], residuals: np.ndarray) -> np.ndarray:
-        """Return the factor by which eps that scatters from impact to impact widens each error.
+    def scatter(self, values: dict[str, Any], residuals: np.ndarray) -> tuple[float, float]:
+        """Return the standard deviation of eps from impact to impact, and that of a fit.
+
+        The latter is larger: it is estimated from few impacts, and its own error widens the error
+        bar, as Student's t does.
 
         Args:
             values: parameters of the gas, by name; "spread" is the scatter of eps. Without it the
                 most likely scatter is taken where eps scatters (`DropTest.scatters`).
             residuals: measured minus computed values, over their errors.
         """
+        if "spread" in values:
+            return float(values["spread"]), float(values["spread"])
+        if not self.data.scatters:
+            return 0.0, 0.0
+        errors = self._errors(values)
+        spread = most_likely_scatter(residuals[: errors.size], errors)
+        return spread, spread * few_values_factor(errors.size)
+
+    def widening(self, values: dict[str, Any], residuals: np.ndarray) -> np.ndarray:
+        """Return the factor by which eps that scatters from impact to impact widens each error.
+
+        Args:
+            values, residuals: see `scatter`.
+        """
         factors = np.ones(self.data.num_values)
-        if "spread" not in values and not self.data.scatters:
-            return factors
-        errors = np.asarray(self.data.errors(with_parameters(self.gas, values)))
-        spread = float(values.get("spread", 0.0))
-        if "spread" not in values:
-            spread = most_likely_scatter(residuals[: errors.size], errors)
-        factors[: errors.size] = np.hypot(1.0, spread / errors)
+        _, spread = self.scatter(values, residuals)
+        if spread > 0:
+            errors = self._errors(values)
+            factors[: errors.size] = np.hypot(1.0, spread / errors)
         return factors
+
+    def _errors(self, values: dict[str, Any]) -> np.ndarray:
+        return np.asarray(self.data.errors(with_parameters(self.gas, values)))
 
     @property
     def num_points(self) -> int:
@@ -278,6 +295,18 @@ class DropRows:
     def nuisances(self) -> dict[str, float]:
         """It has no nuisance parameters."""
         return {}
+
+
+def few_values_factor(number: int) -> float:
+    """Return the factor of a standard deviation found from a few values, for error bars.
+
+    With it 1.96 of the resulting standard errors of a mean are a 95 % interval by Student's t.
+    """
+    if number < 2:
+        return 1.0
+    degrees = number - 1
+    ratio = scipy.stats.t.ppf(0.975, degrees) / scipy.stats.norm.ppf(0.975)
+    return float(ratio * (number / degrees) ** 0.5)
 
 
 def most_likely_scatter(residuals: np.ndarray, errors: np.ndarray) -> float:

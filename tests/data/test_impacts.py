@@ -17,6 +17,7 @@ ROUGH = jaxgran.Gas(
     container=jaxgran.Walls(0.05, restitution=0.8, tangential_restitution=0.1),
 )
 SIGMA = 2e-3
+VELOCITIES = "nx,ny,nz,vx,vy,vz,vx_after,vy_after,vz_after,v_err"
 
 
 @pytest.fixture
@@ -50,6 +51,15 @@ def test_each_kind_of_columns_gives_the_same_impacts(drops_of):
     )
     assert centres.of_centres and centres.onto == "plate"
     np.testing.assert_allclose(centres.speed_error, 0.01)
+
+
+def test_a_header_line_says_that_eps_scatters(drops_of):
+    for text in (
+        "v,eps,eps_err\n.1,.9,.1\n",
+        f"# spin_before: 0\n{VELOCITIES}\n0,0,1,0,0.1,-1,0,0.1,.9,.01\n",
+    ):
+        assert drops_of(text, eps_scatters="yes").scatters
+        assert not drops_of(text).scatters
 
 
 def rough_impact(before, spin, normal, eps, beta_t, q=0.4):
@@ -93,7 +103,6 @@ def test_a_table_of_beta_t_is_asked_about(drops_of):
 
 
 OBLIQUE = "v_n,v_t,eps,eps_err,eps_t,eps_t_err\n"
-VELOCITIES = "nx,ny,nz,vx,vy,vz,vx_after,vy_after,vz_after,v_err"
 
 
 @pytest.mark.parametrize(
@@ -126,6 +135,7 @@ VELOCITIES = "nx,ny,nz,vx,vy,vz,vx_after,vy_after,vz_after,v_err"
             "0,0,1,0,0,-1,0,0,.9,.01,0,0,0,0,0,0,1\n",
             r"column wx is an angular velocity without a unit .* write wx \(rad/s\)",
         ),
+        ("# eps_scatters: .1\nv,eps,eps_err\n.1,.9,.1\n", "eps_scatters: must be yes or no, got"),
         ("# onto: floor\nv,eps,eps_err\n.1,.9,.1\n", "must be one of sphere, plate, wall, got 'fl"),
     ],
 )

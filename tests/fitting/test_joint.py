@@ -9,6 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran import read_measurement
+from jaxgran.scene.laws import ViscoelasticVariant
 from tests.beads import glass_beads
 from tests.data.curve_files import IN_MM, PLAIN, TIMES, T, text_of
 from tests.fitting.curves import A, deviation, in_range, synthetic
@@ -42,6 +43,40 @@ def test_a_drop_test_gives_its_constant(onto_plate):
     alone = jaxgran.fit(one)
     assert float(alone.standard_error[0]) == pytest.approx(2**0.5 * error, rel=0.05)
     assert alone.grade == "determined"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_skewed", [False, True])
+def test_the_error_bar_of_few_impacts_whose_eps_scatters_holds(is_skewed):
+    gas = glass_beads(0.15)
+    speed = np.geomspace(0.05, 1.0, 8)
+    eps = np.asarray(gas.restitution(speed))
+    rng = np.random.default_rng(0)
+    held = 0
+    for _ in range(100):
+        noise = 1 - rng.exponential(size=8) if is_skewed else rng.normal(size=8)
+        test = jaxgran.DropTest(speed, eps + 0.02 * noise, np.full(8, 0.003), scatters=True)
+        result = jaxgran.fit(of_drops(gas, test), quick=True)
+        held += deviation(result, gas) < 1.96
+    assert 88 <= held <= 99
+
+
+def test_eps_of_a_gas_scatters_as_that_of_its_impacts():
+    gas = glass_beads(0.1)
+    law = ViscoelasticVariant.from_law(gas.law)
+    grains = dataclasses.replace(gas, law=dataclasses.replace(law, spread=0.1))
+    curve = synthetic(grains, relative_error=0.003)
+    cooled = jaxgran.Measurement(gas, curve, num_particles=10**7, errors_measured=True)
+    speed = jnp.geomspace(0.02, 0.2, 200)
+    eps = gas.restitution(speed) + 0.1 * jax.random.normal(jax.random.key(0), (200,))
+    drops = jaxgran.DropTest(speed, eps.clip(0.0, 1.0), jnp.full(200, 0.01))
+    offs = []
+    for scatters in (False, True):
+        test = dataclasses.replace(drops, scatters=scatters)
+        result = jaxgran.fit({"gas": cooled, "drops": of_drops(gas, test)}, quick=True)
+        offs.append(result.estimate[0] / gas.value(A) - 1)
+    assert any("eps of the impacts scatters by 0.09" in x for x in result.reasons)
+    print(offs)
 
 
 def test_a_restitution_that_is_flat_is_not_viscoelastic():
