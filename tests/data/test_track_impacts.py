@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.data.track_impacts import _Motion
-from tests.beads import glass_beads
+from jaxgran.data.flights import fit_lines
+from jaxgran.data.motion import Motion
 
 HEADER = {"eta": 0.03, "diameter": 2e-3, "density": 2500, "Y": 5e7, "nu": 0.22, "T0": 0.01}
 PLAIN = "\n".join(
@@ -49,11 +49,9 @@ def test_lines_through_short_flights_of_long_tracks_keep_their_digits():
     ids = np.repeat(np.arange(particles), frames)
     path = 0.05 * np.sin(40 * t + ids)
     columns = {"id": ids, "t": t, "x": path, "y": 0.5 * path, "z": 0.1 * path}
-    header = {"localisation_error": "1e-6"}
-    lines = list(range(t.size))
-    motion = _Motion.of_columns(columns, header, lines, glass_beads(0.15))
+    motion = Motion.from_columns(columns, {}, lines=list(range(t.size)))
     begin = np.array([7, 399_000, t.size - length])
-    found = motion.lines(begin, begin + length)
+    found = fit_lines(motion, begin, begin + length)
     for k, first in enumerate(begin):
         rows = slice(first, first + length)
         slope = np.polyfit(t[rows] - t[first], path[rows], 1)[0]

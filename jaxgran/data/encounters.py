@@ -1,0 +1,263 @@
+"""Encounters in tracks: where a sphere comes so near to another one, or to a wall, that they may
+have met between two frames."""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy  # which imports scipy.spatial at its first use
+from jaxtyping import Bool, Float, Int
+
+from jaxgran.data.drop_test import MAX_SIGMAS
+from jaxgran.data.motion import Motion
+from jaxgran.scene.gas import Gas
+
+NUM_SIGMAS = 4.0
+"""Standard errors by which a distance may be wrong in the search for encounters."""
+
+FAST_STEP = 0.999
+"""Quantile of the displacements between frames that counts as the largest one."""
+
+MAX_GAP = 2
+"""Largest number of frames from one frame of an encounter to the next."""
+
+NUM_STEPS = 3
+"""Number of frames over which a relative speed is estimated."""
+
+WALL_TOLERANCE = 0.05
+"""Largest difference of the extent of all positions, beyond their errors, from the side of the
+container less a diameter, in diameters."""
+
+WALL = -1
+"""Stands for a wall in place of the number of a particle."""
+
+
+class Encounters(NamedTuple):
+    """Spheres that come near each other, or near a wall.
+
+    The separation r of both partners is ``position of first - position of second - shift``, where
+    the position of a wall is 0.
+
+    Attributes:
+        first: number of the particle.
+        second: number of its partner, or `WALL`.
+        shift: m; of spheres, from the second one to its periodic image next to the first one; of
+            walls, a point that the centre of a sphere reaches.
+        normal: unit vector away from a wall; 0 of spheres.
+        time: of the closest frame, s.
+        half_width: frames on each side of this time that may be before or after the impact.
+    """
+
+    first: Int[np.ndarray, "n"]
+    second: Int[np.ndarray, "n"]
+    shift: Float[np.ndarray, "n d"]
+    normal: Float[np.ndarray, "n d"]
+    time: Float[np.ndarray, "n"]
+    half_width: Float[np.ndarray, "n"]
+
+    @property
+    def is_wall(self) -> Bool[np.ndarray, "n"]:
+        """Whether the partner is a wall."""
+        return self.second == WALL
+
+
+def find_encounters(motion: Motion, gas: Gas, error: float) -> Encounters:
+    """Return the encounters of spheres with each other and with the walls of a container.
+
+    Args:
+        motion: of the spheres.
+        gas: that gives their diameter, and the container if there is one.
+        error: standard error of a coordinate, m.
+    """
+    found = [_encounters_of_spheres(motion, float(gas.diameter), error)]
+    if gas.container is not None:
+        found += _encounters_with_walls(motion, gas, error)
+    return Encounters(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+
+
+def _encounters_of_spheres(motion: Motion, diameter: float, error: float) -> Encounters:
+    """Return encounters of two spheres that may be impacts."""
+    blur = 2**0.5 * error
+    a, b = _near_rows(motion, diameter + _largest_step(motion) + NUM_SIGMAS * blur)
+    apart = motion.position[a] - motion.position[b]
+    shift = np.zeros_like(apart)
+    if motion.side < np.inf:
+        shift = motion.side * np.round(apart / motion.side)
+    distance = np.linalg.norm(apart - shift, axis=1)
+    pair = motion.particle[a] * (np.max(motion.particle) + 1) + motion.particle[b]
+    chosen = _closest_frames(pair, motion.frame[a], distance)
+    step = _relative_step(motion, a[chosen], b[chosen])
+    # In half a step the distance was smaller before or after the closest frame.
+    may_touch = distance[chosen] <= diameter + step / 2 + NUM_SIGMAS * blur
+    chosen = chosen[may_touch]
+    a = a[chosen]
+    b = b[chosen]
+    return Encounters(
+        motion.particle[a],
+        motion.particle[b],
+        shift[chosen],
+        np.zeros_like(shift[chosen]),
+        motion.time[a],
+        _half_width(step[may_touch], blur),
+    )
+
+
+def _largest_step(motion: Motion) -> float:
+    """Return the largest displacement between frames, m."""
+    same = motion.particle[1:] == motion.particle[:-1]
+    steps = np.linalg.norm(np.diff(motion.position, axis=0), axis=1)[same]
+    if steps.size == 0:
+        raise ValueError(
+            "no particle occurs in two frames. Give each particle the same id in all frames"
+        )
+    return float(np.quantile(steps, FAST_STEP))
+
+
+def _near_rows(
+    motion: Motion, reach: float
+) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
+    """Return the rows of all pairs of particles that are nearer than `reach`, m, in a frame."""
+    order = np.argsort(motion.frame, kind="stable")
+    frames = np.split(order, np.flatnonzero(np.diff(motion.frame[order])) + 1)
+    found = [np.zeros((0, 2), int)]
+    for rows in frames:
+        tree = _tree(motion.position[rows], motion.side)
+        found.append(rows[tree.query_pairs(reach, output_type="ndarray")])
+    a, b = np.sort(np.concatenate(found), axis=1).T
+    return a, b
+
+
+def _tree(position: Float[np.ndarray, "n d"], side: float) -> scipy.spatial.KDTree:
+    """Return a tree that finds neighbours, in a periodic box if its side is finite."""
+    if side == np.inf:
+        return scipy.spatial.KDTree(position)
+    wrapped = np.mod(position, side)
+    # The remainder of a small negative number is rounded to the side itself, which is outside.
+    wrapped = np.where(wrapped >= side, 0.0, wrapped)
+    return scipy.spatial.KDTree(wrapped, boxsize=side)
+
+
+def _closest_frames(
+    pair: Int[np.ndarray, "n"], frame: Int[np.ndarray, "n"], distance: Float[np.ndarray, "n"]
+) -> Int[np.ndarray, "encounters"]:
+    """Return the index of the closest frame of each encounter.
+
+    Frames of one pair with gaps of up to `MAX_GAP` are one encounter.
+
+    Args:
+        pair: number of the pair of partners.
+        frame: in which they are near each other.
+        distance: of the partners in this frame, m.
+    """
+    order = np.lexsort((frame, pair))
+    is_new_pair = np.diff(pair[order], prepend=-1) != 0
+    is_later = np.diff(frame[order], prepend=0) > MAX_GAP
+    encounter = np.empty(order.size, int)
+    encounter[order] = np.cumsum(is_new_pair | is_later)
+    by_distance = np.lexsort((distance, encounter))
+    _, closest = np.unique(encounter[by_distance], return_index=True)
+    return by_distance[closest]
+
+
+def _relative_step(
+    motion: Motion, a: Int[np.ndarray, "n"], b: Int[np.ndarray, "n"]
+) -> Float[np.ndarray, "n"]:
+    """Return how far particles move relative to each other between two frames, m.
+
+    Args:
+        motion: of all particles.
+        a, b: rows of both particles in one frame. The step is the larger one of those before and
+            after it, as an impact changes the relative velocity.
+    """
+    speed = np.maximum(
+        _relative_speed(motion, a, b, -NUM_STEPS), _relative_speed(motion, a, b, NUM_STEPS)
+    )
+    return speed * motion.frame_time
+
+
+def _relative_speed(
+    motion: Motion, a: Int[np.ndarray, "n"], b: Int[np.ndarray, "n"], steps: int
+) -> Float[np.ndarray, "n"]:
+    """Return the relative speed over the next frames, or the last ones if `steps` < 0, m/s."""
+
+    def displacement(row: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n d"]:
+        other = np.clip(row + steps, 0, motion.particle.size - 1)
+        is_same = motion.particle[other] == motion.particle[row]
+        return motion.position[np.where(is_same, other, row)] - motion.position[row]
+
+    moved = displacement(a) - displacement(b)
+    return np.linalg.norm(moved, axis=1) / (abs(steps) * motion.frame_time)
+
+
+def _half_width(step: Float[np.ndarray, "n"], error: float) -> Float[np.ndarray, "n"]:
+    """Return how many frames around the closest one may lie on either side of an impact.
+
+    Without errors of positions it is the closest frame alone.
+
+    Args:
+        step: relative displacement between frames, m.
+        error: of a distance, m.
+    """
+    return np.maximum(1.0, 3 * error / np.maximum(step, error))
+
+
+def _encounters_with_walls(motion: Motion, gas: Gas, error: float) -> list[Encounters]:
+    """Return encounters of spheres with each wall of the container."""
+    assert gas.container is not None
+    d = motion.num_coordinates
+    diameter = float(gas.diameter)
+    room = np.broadcast_to(np.asarray(gas.container.side), (d,)) - diameter
+    low = motion.position.min(axis=0)
+    high = motion.position.max(axis=0)
+    _check_extent(high - low, room, WALL_TOLERANCE * diameter + 2 * MAX_SIGMAS * error)
+    # The container is centred on the positions.
+    lower = (low + high - room) / 2
+    upper = (low + high + room) / 2
+    found = []
+    for axis in range(d):
+        found.append(_encounters_with_wall(motion, axis, 1.0, lower[axis], error))
+        found.append(_encounters_with_wall(motion, axis, -1.0, upper[axis], error))
+    return found
+
+
+def _check_extent(
+    extent: Float[np.ndarray, "d"], room: Float[np.ndarray, "d"], allowed: float
+) -> None:
+    """Raise ValueError unless the positions extend as far as walls let the centres move, m."""
+    if np.any(np.abs(extent - room) > allowed):
+        raise ValueError(
+            "the positions extend over "
+            f"{' x '.join(f'{x:.4g}' for x in extent)} m, and walls at container_side leave "
+            f"{' x '.join(f'{x:.4g}' for x in room)} m to the centres: impacts on walls need walls "
+            "parallel to the coordinates, which some of the particles reach. Correct "
+            "container_side, or leave it out to read the impacts of spheres alone"
+        )
+
+
+def _encounters_with_wall(
+    motion: Motion, axis: int, sign: float, end: float, error: float
+) -> Encounters:
+    """Return encounters of spheres with one wall.
+
+    Args:
+        motion: of the spheres.
+        axis: normal to the wall.
+        sign: 1 of a wall at the lower end of the axis, -1 at the upper end.
+        end: largest or smallest coordinate of a centre, m.
+        error: standard error of a coordinate, m.
+    """
+    height = sign * (motion.position[:, axis] - end)
+    step = np.abs(np.diff(height, append=height[-1:]))
+    near = np.flatnonzero(height <= step / 2 + NUM_SIGMAS * error)
+    row = near[_closest_frames(motion.particle[near], motion.frame[near], height[near])]
+    shift = np.zeros((row.size, motion.num_coordinates))
+    shift[:, axis] = end
+    normal = np.zeros_like(shift)
+    normal[:, axis] = sign
+    return Encounters(
+        motion.particle[row],
+        np.full(row.size, WALL),
+        shift,
+        normal,
+        motion.time[row],
+        _half_width(step[row], error),
+    )
