@@ -1,5 +1,7 @@
-"""Encounters in tracks: where a sphere comes so near to another one, or to a wall, that they may
-have met between two frames."""
+"""Encounters in tracks: spheres so near to each other, or to a wall, that they may have touched.
+
+They are found by distances in single frames, before any line is known.
+"""
 
 from typing import NamedTuple
 
@@ -27,8 +29,8 @@ WALL_TOLERANCE = 0.05
 """Largest difference of the extent of all positions, beyond their errors, from the side of the
 container less a diameter, in diameters."""
 
-WALL = -1
-"""Stands for a wall in place of the number of a particle."""
+WALL_NUMBER = -1
+"""Stands for a wall where a particle has its number."""
 
 
 class Encounters(NamedTuple):
@@ -38,12 +40,12 @@ class Encounters(NamedTuple):
     the position of a wall is 0.
 
     Attributes:
-        first: number of the particle.
-        second: number of its partner, or `WALL`.
-        shift: m; of spheres, from the second one to its periodic image next to the first one; of
-            walls, a point that the centre of a sphere reaches.
-        normal: unit vector away from a wall; 0 of spheres.
-        time: of the closest frame, s.
+        first: number of a particle.
+        second: number of its partner, or `WALL_NUMBER`.
+        shift: from a second sphere to its periodic image next to the first one, or from the origin
+            to a point at the wall that the centre of a sphere reaches, m.
+        normal: unit vector away from a wall; 0 for two spheres.
+        time: time of the closest frame, s.
         half_width: frames on each side of this time that may be before or after the impact.
     """
 
@@ -57,16 +59,16 @@ class Encounters(NamedTuple):
     @property
     def is_wall(self) -> Bool[np.ndarray, "n"]:
         """Whether the partner is a wall."""
-        return self.second == WALL
+        return self.second == WALL_NUMBER
 
 
 def find_encounters(motion: Motion, gas: Gas, error: float) -> Encounters:
     """Return the encounters of spheres with each other and with the walls of a container.
 
     Args:
-        motion: of the spheres.
-        gas: that gives their diameter, and the container if there is one.
-        error: standard error of a coordinate, m.
+        motion: motion of the spheres.
+        gas: gas with their diameter and, if there are walls, a container.
+        error: localisation error, the standard error of a coordinate, m.
     """
     found = [_encounters_of_spheres(motion, float(gas.diameter), error)]
     if gas.container is not None:
@@ -86,7 +88,7 @@ def _encounters_of_spheres(motion: Motion, diameter: float, error: float) -> Enc
     pair = motion.particle[a] * (np.max(motion.particle) + 1) + motion.particle[b]
     chosen = _closest_frames(pair, motion.frame[a], distance)
     step = _relative_step(motion, a[chosen], b[chosen])
-    # In half a step the distance was smaller before or after the closest frame.
+    # Between frames they come nearer than in the closest one, by up to half a step.
     may_touch = distance[chosen] <= diameter + step / 2 + NUM_SIGMAS * blur
     chosen = chosen[may_touch]
     a = a[chosen]
@@ -126,7 +128,7 @@ def _near_rows(
     return a, b
 
 
-def _tree(position: Float[np.ndarray, "n d"], side: float) -> scipy.spatial.KDTree:
+def _tree(position: Float[np.ndarray, "n d"], side: float) -> "scipy.spatial.KDTree":
     """Return a tree that finds neighbours, in a periodic box if its side is finite."""
     if side == np.inf:
         return scipy.spatial.KDTree(position)
@@ -144,9 +146,9 @@ def _closest_frames(
     Frames of one pair with gaps of up to `MAX_GAP` are one encounter.
 
     Args:
-        pair: number of the pair of partners.
-        frame: in which they are near each other.
-        distance: of the partners in this frame, m.
+        pair: number of the pair of partners, one entry for each frame.
+        frame: frame in which they are near each other.
+        distance: distance in this frame, m.
     """
     order = np.lexsort((frame, pair))
     is_new_pair = np.diff(pair[order], prepend=-1) != 0
@@ -164,9 +166,9 @@ def _relative_step(
     """Return how far particles move relative to each other between two frames, m.
 
     Args:
-        motion: of all particles.
-        a, b: rows of both particles in one frame. The step is the larger one of those before and
-            after it, as an impact changes the relative velocity.
+        motion: motion of all particles.
+        a, b: rows of both particles in one frame. The step is the larger one of the steps before
+            and after this frame, as an impact changes the relative velocity.
     """
     speed = np.maximum(
         _relative_speed(motion, a, b, -NUM_STEPS), _relative_speed(motion, a, b, NUM_STEPS)
@@ -195,7 +197,7 @@ def _half_width(step: Float[np.ndarray, "n"], error: float) -> Float[np.ndarray,
 
     Args:
         step: relative displacement between frames, m.
-        error: of a distance, m.
+        error: standard error of a distance, m.
     """
     return np.maximum(1.0, 3 * error / np.maximum(step, error))
 
@@ -239,11 +241,11 @@ def _encounters_with_wall(
     """Return encounters of spheres with one wall.
 
     Args:
-        motion: of the spheres.
-        axis: normal to the wall.
-        sign: 1 of a wall at the lower end of the axis, -1 at the upper end.
-        end: largest or smallest coordinate of a centre, m.
-        error: standard error of a coordinate, m.
+        motion: motion of the spheres.
+        axis: number of the coordinate normal to the wall.
+        sign: 1 for the wall at the lower end of this axis, -1 at the upper end.
+        end: coordinate of centres at the wall, m.
+        error: localisation error, m.
     """
     height = sign * (motion.position[:, axis] - end)
     step = np.abs(np.diff(height, append=height[-1:]))
@@ -255,7 +257,7 @@ def _encounters_with_wall(
     normal[:, axis] = sign
     return Encounters(
         motion.particle[row],
-        np.full(row.size, WALL),
+        np.full(row.size, WALL_NUMBER),
         shift,
         normal,
         motion.time[row],

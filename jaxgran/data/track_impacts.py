@@ -1,8 +1,8 @@
 """Single impacts from tracks of particles: speeds before and after, with their errors.
 
-Between impacts a particle moves in a straight line. Lines through its positions before and after an
-encounter (`flights`) tell whether, when and how fast two spheres meet (`contacts`). All of it works
-on arrays of all encounters (`encounters`) at once.
+Between impacts a particle moves in a straight line. Lines through the positions before and after an
+encounter tell whether, when and how fast two spheres meet. The modules `encounters`, `flights` and
+`contacts` are the three steps, each for all encounters at once.
 """
 
 from collections.abc import Mapping
@@ -33,7 +33,7 @@ TIME_ERRORS = 2.0
 """Frames nearer to an impact than this many errors of its time belong to no flight."""
 
 NUM_PASSES = 3
-"""Number of times that flights are delimited by the contacts found before."""
+"""Number of times that flights are divided anew, at the contacts found before."""
 
 
 class Impacts(NamedTuple):
@@ -50,8 +50,8 @@ class Impacts(NamedTuple):
             their identities from 0 on, and the times, s.
         localisation_error: standard error of one coordinate, m, as given or as the scatter about
             the lines shows.
-        header: of the file, in SI.
-        gas: that the header describes.
+        header: header of the file, in SI.
+        gas: gas that it describes.
 
     >>> jaxgran.Impacts(None, None, {"used": 0}, ([], [], []), 4e-5, {}, gas).measurements
     {}
@@ -92,7 +92,7 @@ def read_impacts(path: str | Path, header: dict[str, Any] | None = None) -> Impa
     """Read the single impacts of spheres, and of spheres with walls, from tracks of particles.
 
     Two spheres that come near each other are an impact if the straight lines of their flights
-    before it pass at less than a diameter, by `MARGIN` standard errors. The lines touch at the time
+    before it pass at less than a diameter, by 1.5 standard errors. The lines touch at the time
     t* with the unit vector n between the centres; with the relative velocities g and g' by the
     lines before and after t*,
 
@@ -155,10 +155,10 @@ def impacts_of_tracks(
     """Return the impacts that positions in frames show: see `read_impacts`.
 
     Args:
-        columns: those of `tracks.track_columns`, in SI; rows in any order.
-        header: in SI.
-        lines: line number of each row.
-        gas: with the diameter of the spheres and, if there is one, their container.
+        columns: columns of `tracks.track_columns`, in SI; rows in any order.
+        header: header of the file, in SI.
+        lines: line number of each row, for errors.
+        gas: gas with the diameter of the spheres and, if there are walls, a container.
     """
     motion = Motion.from_columns(columns, header, lines)
     _check_motion(motion, gas)
@@ -209,10 +209,7 @@ def _given_error(header: dict[str, str]) -> float | None:
 
 
 def _breaks_at_contacts(encounters: Encounters, contacts: Contacts, frame_time: float) -> Breaks:
-    """Return the breaks of flights at contacts, or at the closest frames where these are unknown.
-
-    Encounters without a contact are no breaks.
-    """
+    """Return the breaks of flights at contacts, or at closest frames where no contact is known."""
     is_known = (contacts.count_before >= MIN_TIMED) & contacts.is_straight
     is_timed = is_known & contacts.touches
     frames_off = TIME_ERRORS * contacts.time_error / frame_time
@@ -249,7 +246,7 @@ def _chosen_impacts(
 
 
 def _used_and_counts(contacts: Contacts) -> tuple[Bool[np.ndarray, "n"], dict[str, int]]:
-    """Return which encounters are used, and how many are for each reason not."""
+    """Return which encounters are used, and how many these are and are left out for each reason."""
     eps, error = _restitution(contacts)
     passes = {
         "few frames": contacts.count >= MIN_FRAMES,
