@@ -79,27 +79,25 @@ def find_encounters(motion: Motion, gas: Gas, error: float) -> Encounters:
 def _encounters_of_spheres(motion: Motion, diameter: float, error: float) -> Encounters:
     """Return encounters of two spheres that may be impacts."""
     blur = 2**0.5 * error
-    a, b = _near_rows(motion, diameter + _largest_step(motion) + NUM_SIGMAS * blur)
-    apart = motion.position[a] - motion.position[b]
+    first, second = _near_rows(motion, diameter + _largest_step(motion) + NUM_SIGMAS * blur)
+    apart = motion.position[first] - motion.position[second]
     shift = np.zeros_like(apart)
     if motion.side < np.inf:
         shift = motion.side * np.round(apart / motion.side)
     distance = np.linalg.norm(apart - shift, axis=1)
-    pair = motion.particle[a] * (np.max(motion.particle) + 1) + motion.particle[b]
-    chosen = _closest_frames(pair, motion.frame[a], distance)
-    step = _relative_step(motion, a[chosen], b[chosen])
+    pair = motion.particle[first] * (np.max(motion.particle) + 1) + motion.particle[second]
+    chosen = _closest_frames(pair, motion.frame[first], distance)
+    step = _relative_step(motion, first[chosen], second[chosen])
     # Between frames they come nearer than in the closest one, by up to half a step.
     may_touch = distance[chosen] <= diameter + step / 2 + NUM_SIGMAS * blur
     chosen = chosen[may_touch]
-    a = a[chosen]
-    b = b[chosen]
     return Encounters(
-        motion.particle[a],
-        motion.particle[b],
-        shift[chosen],
-        np.zeros_like(shift[chosen]),
-        motion.time[a],
-        _half_width(step[may_touch], blur),
+        first=motion.particle[first[chosen]],
+        second=motion.particle[second[chosen]],
+        shift=shift[chosen],
+        normal=np.zeros_like(shift[chosen]),
+        time=motion.time[first[chosen]],
+        half_width=_half_width(step[may_touch], blur),
     )
 
 
@@ -124,8 +122,8 @@ def _near_rows(
     for rows in frames:
         tree = _tree(motion.position[rows], motion.side)
         found.append(rows[tree.query_pairs(reach, output_type="ndarray")])
-    a, b = np.sort(np.concatenate(found), axis=1).T
-    return a, b
+    first, second = np.sort(np.concatenate(found), axis=1).T
+    return first, second
 
 
 def _tree(position: Float[np.ndarray, "n d"], side: float) -> "scipy.spatial.KDTree":
@@ -161,23 +159,22 @@ def _closest_frames(
 
 
 def _relative_step(
-    motion: Motion, a: Int[np.ndarray, "n"], b: Int[np.ndarray, "n"]
+    motion: Motion, first: Int[np.ndarray, "n"], second: Int[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n"]:
     """Return how far particles move relative to each other between two frames, m.
 
     Args:
         motion: motion of all particles.
-        a, b: rows of both particles in one frame. The step is the larger one of the steps before
+        first, second: rows of both particles in one frame. The step is the larger one of the steps before
             and after this frame, as an impact changes the relative velocity.
     """
-    speed = np.maximum(
-        _relative_speed(motion, a, b, -NUM_STEPS), _relative_speed(motion, a, b, NUM_STEPS)
-    )
-    return speed * motion.frame_time
+    speed_before = _relative_speed(motion, first, second, -NUM_STEPS)
+    speed_after = _relative_speed(motion, first, second, NUM_STEPS)
+    return np.maximum(speed_before, speed_after) * motion.frame_time
 
 
 def _relative_speed(
-    motion: Motion, a: Int[np.ndarray, "n"], b: Int[np.ndarray, "n"], steps: int
+    motion: Motion, first: Int[np.ndarray, "n"], second: Int[np.ndarray, "n"], steps: int
 ) -> Float[np.ndarray, "n"]:
     """Return the relative speed over the next frames, or the last ones if `steps` < 0, m/s."""
 
@@ -186,7 +183,7 @@ def _relative_speed(
         is_same = motion.particle[other] == motion.particle[row]
         return motion.position[np.where(is_same, other, row)] - motion.position[row]
 
-    moved = displacement(a) - displacement(b)
+    moved = displacement(first) - displacement(second)
     return np.linalg.norm(moved, axis=1) / (abs(steps) * motion.frame_time)
 
 
@@ -256,10 +253,10 @@ def _encounters_with_wall(
     normal = np.zeros_like(shift)
     normal[:, axis] = sign
     return Encounters(
-        motion.particle[row],
-        np.full(row.size, WALL_NUMBER),
-        shift,
-        normal,
-        motion.time[row],
-        _half_width(step[row], error),
+        first=motion.particle[row],
+        second=np.full(row.size, WALL_NUMBER),
+        shift=shift,
+        normal=normal,
+        time=motion.time[row],
+        half_width=_half_width(step[row], error),
     )
