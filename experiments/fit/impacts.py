@@ -24,7 +24,7 @@ from experiments.fit.wrong_physics import NORMAL, NUM_PARTICLES, TRUE_A, beads
 from experiments.support.analysis import fit_quietly
 from experiments.support.record import Options, run_parts
 from experiments.support.scenes import cool
-from jaxgran.data import track_impacts
+from jaxgran.data.track_impacts import impacts_of_tracks
 from jaxgran.data.tracks import curve_of_tracks
 
 RATE = 500.0
@@ -133,8 +133,7 @@ def found_impacts(film: Film, gas: jaxgran.Gas, error: float, seed: int) -> jaxg
     columns = columns_of(film, error, seed)
     header = header_of(film, error)
     lines = list(range(columns["t"].size))
-    motion = track_impacts._Motion.of_columns(columns, header, lines, gas)
-    return track_impacts._impacts_of(motion, gas, header)
+    return impacts_of_tracks(columns, header, lines, gas)
 
 
 def joint_fit(

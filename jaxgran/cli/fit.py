@@ -61,6 +61,11 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
             f"--model {options.model}: drop tests and several measurements are fitted with "
             f"{JOINT_MODEL}. Fit the curves one by one with other models."
         )
+    if options.impacts and not paths:
+        raise ValueError(
+            "--impacts needs tracks of particles, and drop tests have none. Give a file of tracks, "
+            "or leave out --impacts."
+        )
     if options.report:
         import_extra("jinja2", "report")  # before the long part
     picture, record = output_files(files[0].stem, options)

@@ -1,10 +1,12 @@
-"""Tracks that cannot show impacts, and lines through short flights of long tracks."""
+"""Tracks that cannot show impacts, lines through flights, and errors of the speeds of impacts."""
 
 import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.data.track_impacts import _Motion
+from jaxgran.data.flights import fit_lines
+from jaxgran.data.motion import Motion
+from jaxgran.data.track_impacts import impacts_of_tracks
 from tests.beads import glass_beads
 
 HEADER = {"eta": 0.03, "diameter": 2e-3, "density": 2500, "Y": 5e7, "nu": 0.22, "T0": 0.01}
@@ -49,13 +51,49 @@ def test_lines_through_short_flights_of_long_tracks_keep_their_digits():
     ids = np.repeat(np.arange(particles), frames)
     path = 0.05 * np.sin(40 * t + ids)
     columns = {"id": ids, "t": t, "x": path, "y": 0.5 * path, "z": 0.1 * path}
-    header = {"localisation_error": "1e-6"}
-    lines = list(range(t.size))
-    motion = _Motion.of_columns(columns, header, lines, glass_beads(0.15))
+    motion = Motion.from_columns(columns, {}, lines=list(range(t.size)))
     begin = np.array([7, 399_000, t.size - length])
-    found = motion.lines(begin, begin + length)
+    found = fit_lines(motion, begin, begin + length)
     for k, first in enumerate(begin):
         rows = slice(first, first + length)
         slope = np.polyfit(t[rows] - t[first], path[rows], 1)[0]
         assert found.velocity[k, 0] == pytest.approx(slope, rel=1e-7)
         assert found.square[k] == pytest.approx(np.sum((t[rows] - t[rows].mean()) ** 2), rel=1e-7)
+
+
+def test_errors_of_speeds_are_the_scatter_of_equal_impacts():
+    # 2000 pairs, far from each other, make one oblique impact with eps = .8 in the plane x,y.
+    pairs, frames, error = 2000, 24, 2e-5
+    gas = glass_beads()
+    diameter = float(gas.diameter)
+    times = np.arange(frames) / 500
+    time = times[frames // 2] + 3e-4
+    g = np.array([-0.3, 0.1, 0.0])
+    normal = np.array([0.8, 0.6, 0.0])
+    speed = -g @ normal
+    change = 1.8 * speed * normal / 2
+    passed = (times - time)[:, None]
+    later = np.maximum(passed, 0)
+    first = diameter * normal + passed * g + later * change
+    second = -later * change
+    apart = 0.1 * np.arange(pairs)[:, None] * np.array([0.0, 0.0, 1.0])
+    position = np.stack([apart + first[:, None], apart + second[:, None]], axis=2)
+    rng = np.random.default_rng(0)
+    position = position.reshape(-1, 3) + error * rng.standard_normal((2 * frames * pairs, 3))
+    columns = dict(zip("xyz", position.T, strict=True))
+    columns["id"] = np.tile(np.arange(2.0 * pairs), frames)
+    columns["t"] = np.repeat(times, 2 * pairs)
+    header = {"localisation_error": str(error)}
+    found = impacts_of_tracks(columns, header, list(range(len(position))), gas).spheres
+    assert len(found.speed) > 0.95 * pairs
+    before = np.asarray(found.speed)
+    after = before * np.asarray(found.restitution)
+    error_before = np.asarray(found.speed_error)
+    error_after = np.asarray(found.error) * before
+    correlation = np.corrcoef(before, after)[0, 1]
+    assert np.mean(before) == pytest.approx(speed, rel=2e-3)
+    assert np.mean(after) == pytest.approx(0.8 * speed, rel=2e-3)
+    assert np.std(before) == pytest.approx(np.mean(error_before), rel=0.06)
+    assert np.std(after) == pytest.approx(np.mean(error_after), rel=0.06)
+    assert correlation == pytest.approx(np.mean(np.asarray(found.correlation)), abs=0.06)
+    assert abs(correlation) > 0.2

@@ -9,7 +9,7 @@ import pytest
 import jaxgran
 from experiments.fit import impacts as study
 from experiments.fit.wrong_physics import SIDE
-from jaxgran.data import track_impacts
+from jaxgran.data.track_impacts import impacts_of_tracks
 from tests.data.test_tracks import text_of
 
 HEADER = {"eta": 0.03, "diameter": 2e-3, "density": 2500, "Y": 5e7, "nu": 0.22, "T0": 0.01}
@@ -89,8 +89,7 @@ def test_many_rows_take_seconds(filmed):
     begin = time.perf_counter()
     header = {"box_side": str(filmed.side), "localisation_error": "4e-5"}
     lines = list(range(columns["t"].size))
-    motion = track_impacts._Motion.of_columns(columns, header, lines, filmed.gas)
-    track_impacts._impacts_of(motion, filmed.gas, header)
+    impacts_of_tracks(columns, header, lines, filmed.gas)
     assert (time.perf_counter() - begin) / columns["t"].size < 5 / 1e5
 
 
