@@ -20,8 +20,8 @@ from jaxgran.data import files, tracks
 from jaxgran.data.curve import QUANTITIES, CoolingCurve, check_values, from_arrays, to_arrays
 from jaxgran.data.definitions import BY_COLUMN, TEMPERATURE_COLUMNS
 from jaxgran.data.drop_test import DropTest
+from jaxgran.data.drop_test_file import drop_test_columns, drop_test_of_table, is_drop_test
 from jaxgran.data.header import checked_header, gas_or_none
-from jaxgran.data.impacts import drop_test_columns, drop_test_of_table, is_drop_test
 from jaxgran.data.questions import ask_about_columns, ask_about_speeds, scene_of
 from jaxgran.data.tables import Table, header_entry, header_in_si, read_table
 

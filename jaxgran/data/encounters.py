@@ -165,8 +165,8 @@ def _relative_step(
 
     Args:
         motion: motion of all particles.
-        first, second: rows of both particles in one frame. The step is the larger one of the steps before
-            and after this frame, as an impact changes the relative velocity.
+        first, second: rows of both particles in one frame. The step is the larger one of the
+            steps before and after this frame, as an impact changes the relative velocity.
     """
     speed_before = _relative_speed(motion, first, second, -NUM_STEPS)
     speed_after = _relative_speed(motion, first, second, NUM_STEPS)
@@ -245,7 +245,8 @@ def _encounters_with_wall(
         error: localisation error, m.
     """
     height = sign * (motion.position[:, axis] - end)
-    step = np.abs(np.diff(height, append=height[-1:]))
+    is_last = np.diff(motion.particle, append=-1) != 0
+    step = np.where(is_last, 0.0, np.abs(np.diff(height, append=0.0)))
     near = np.flatnonzero(height <= step / 2 + NUM_SIGMAS * error)
     row = near[_closest_frames(motion.particle[near], motion.frame[near], height[near])]
     shift = np.zeros((row.size, motion.num_coordinates))

@@ -186,8 +186,8 @@ def flights_between(
     Args:
         motion: motion of all particles.
         first: number of the first partner in each encounter.
-        second: number of the second one. The lines of walls, with negative numbers, are
-            meaningless: see `Flights.with_walls`.
+        second: number of the second one. Walls, with negative numbers, have no rows: see
+            `Flights.with_walls`.
         breaks: one for each encounter.
     """
     particle = np.concatenate([first, second])
@@ -197,7 +197,7 @@ def flights_between(
     since, until = _free_frames(particle, frame, width, ends_others, motion.num_frames)
 
     def rows(frame: Float[np.ndarray, "m"]) -> Int[np.ndarray, "m"]:
-        return motion.first_rows(np.maximum(particle, 0), frame)
+        return motion.first_rows(particle, frame)
 
     def lines(begin: Int[np.ndarray, "m"], end: Int[np.ndarray, "m"]) -> LinePairs:
         of_first, of_second = zip(np.split(begin, 2), np.split(end, 2), strict=True)

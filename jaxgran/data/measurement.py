@@ -218,7 +218,7 @@ def read_measurement(
             (`jaxgran.data.curve_file.TEMPERATURE_COLUMNS`), with errors under the same name and
             _err. A drop test has the columns v (m/s), eps and eps_err; oblique impacts have
             v_n,v_t (or v,angle), eps, eps_err, eps_t and eps_t_err, or velocities and spins
-            (`jaxgran.data.impacts.drop_test_of_table`). Tracks of particles have the columns
+            (`jaxgran.data.drop_test_file.drop_test_of_table`). Tracks of particles have the columns
             id,t,x,y and, where measured, z (`jaxgran.data.tracks.curve_of_tracks`).
             Units may stand after a name or a value, as in ``t (ms)`` and ``# diameter: 2 mm``;
             header keys length_unit, time_unit and speed_unit, which holds for T squared, give

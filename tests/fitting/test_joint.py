@@ -74,9 +74,10 @@ def test_eps_of_a_gas_scatters_as_that_of_its_impacts():
     for scatters in (False, True):
         test = dataclasses.replace(drops, scatters=scatters)
         result = jaxgran.fit({"gas": cooled, "drops": of_drops(gas, test)}, quick=True)
-        offs.append(result.estimate[0] / gas.value(A) - 1)
-    assert any("eps of the impacts scatters by 0.09" in x for x in result.reasons)
-    print(offs)
+        offs.append(float(result.estimate[0] / gas.value(A) - 1))
+    assert any("eps of the impacts scatters by 0.088" in x for x in result.reasons)
+    # Impacts of eps above 1 became 1, which lowers the scatter and A a little.
+    assert abs(offs[1]) < 0.03 and offs[0] > 0.08
 
 
 def test_a_restitution_that_is_flat_is_not_viscoelastic():

@@ -52,7 +52,7 @@ def is_drop_test(names: list[str]) -> bool:
 def drop_test_columns(names: list[str]) -> list[str]:
     """Return the columns of a drop test; raise ValueError if one is unknown, missing or repeated.
 
-    >>> from jaxgran.data.impacts import drop_test_columns
+    >>> from jaxgran.data.drop_test_file import drop_test_columns
     >>> drop_test_columns(["v", "eps", "eps_err"])
     ['v', 'eps', 'eps_err']
     """
