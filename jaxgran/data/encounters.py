@@ -163,28 +163,36 @@ def _relative_step(
 ) -> Float[np.ndarray, "n"]:
     """Return how far particles move relative to each other between two frames, m.
 
+    An impact changes the relative velocity: the faster one of before and after counts.
+
     Args:
         motion: motion of all particles.
-        first, second: rows of both particles in one frame. The step is the larger one of the
-            steps before and after this frame, as an impact changes the relative velocity.
+        first, second: rows of both particles in one frame.
     """
-    speed_before = _relative_speed(motion, first, second, -NUM_STEPS)
-    speed_after = _relative_speed(motion, first, second, NUM_STEPS)
-    return np.maximum(speed_before, speed_after) * motion.frame_time
+
+    def speed(steps: int) -> Float[np.ndarray, "n"]:
+        relative = _velocity(motion, first, steps) - _velocity(motion, second, steps)
+        return np.linalg.norm(relative, axis=1)
+
+    return np.maximum(speed(-NUM_STEPS), speed(NUM_STEPS)) * motion.frame_time
 
 
-def _relative_speed(
-    motion: Motion, first: Int[np.ndarray, "n"], second: Int[np.ndarray, "n"], steps: int
-) -> Float[np.ndarray, "n"]:
-    """Return the relative speed over the next frames, or the last ones if `steps` < 0, m/s."""
+def _velocity(motion: Motion, row: Int[np.ndarray, "n"], steps: int) -> Float[np.ndarray, "n d"]:
+    """Return the mean velocity over the next rows of a particle, or the last ones, m/s.
 
-    def displacement(row: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n d"]:
-        other = np.clip(row + steps, 0, motion.particle.size - 1)
-        is_same = motion.particle[other] == motion.particle[row]
-        return motion.position[np.where(is_same, other, row)] - motion.position[row]
-
-    moved = displacement(first) - displacement(second)
-    return np.linalg.norm(moved, axis=1) / (abs(steps) * motion.frame_time)
+    Args:
+        motion: motion of all particles.
+        row: rows at which it begins or ends.
+        steps: number of rows, < 0 for those before. At an end of a track there are fewer; without
+            any the velocity is 0.
+    """
+    particle = motion.particle[row]
+    begin = motion.first_rows(particle, np.zeros(row.size))
+    end = motion.first_rows(particle, np.full(row.size, float(motion.num_frames)))
+    other = np.clip(row + steps, begin, end - 1)
+    elapsed = motion.time[other] - motion.time[row]
+    moved = motion.position[other] - motion.position[row]
+    return moved / np.where(other == row, np.inf, elapsed)[:, None]
 
 
 def _half_width(step: Float[np.ndarray, "n"], error: float) -> Float[np.ndarray, "n"]:
@@ -245,8 +253,10 @@ def _encounters_with_wall(
         error: localisation error, m.
     """
     height = sign * (motion.position[:, axis] - end)
-    is_last = np.diff(motion.particle, append=-1) != 0
-    step = np.where(is_last, 0.0, np.abs(np.diff(height, append=0.0)))
+    row = np.arange(height.size)
+    speeds = [_velocity(motion, row, steps)[:, axis] for steps in (-NUM_STEPS, NUM_STEPS)]
+    # Within one step the velocity may be reversed: a difference of neighbours would depend on eps.
+    step = np.max(np.abs(speeds), axis=0) * motion.frame_time
     near = np.flatnonzero(height <= step / 2 + NUM_SIGMAS * error)
     row = near[_closest_frames(motion.particle[near], motion.frame[near], height[near])]
     shift = np.zeros((row.size, motion.num_coordinates))

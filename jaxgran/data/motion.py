@@ -164,7 +164,8 @@ def error_by_second_differences(motion: Motion) -> float:
     """
     x = motion.position
     is_same = motion.particle[2:] == motion.particle[:-2]
-    second = (x[2:] - 2 * x[1:-1] + x[:-2])[is_same]
+    is_next = motion.frame[2:] - motion.frame[:-2] == 2
+    second = (x[2:] - 2 * x[1:-1] + x[:-2])[is_same & is_next]
     # The variance of x'' - 2 x' + x is 1 + 4 + 1 times the variance of a position.
     error = NORMAL_MAD * np.median(np.abs(second)) / 6**0.5 if second.size else 0.0
     return float(max(error, 1e-9 * np.ptp(x)))

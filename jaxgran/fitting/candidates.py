@@ -292,12 +292,23 @@ def combined(first: Change, second: Change, measurement: Measurement) -> Planned
         return second(changed)
     if changed is None:
         return None
-    main = second(changed[CURVE])
-    if isinstance(main, dict):
-        return changed | main
-    curves = {label: m for label, m in changed.items() if isinstance(m.data, CoolingCurve)}
-    both = {label: second(m) for label, m in curves.items()}
-    return changed | {label: m for label, m in both.items() if isinstance(m, Measurement)}
+    curves = _curves_of(changed)
+    if not curves:
+        return None
+    both = {label: second(changed[label]) for label in curves}
+    main = both[curves[0]]
+    if not isinstance(main, dict):
+        return changed | {label: m for label, m in both.items() if isinstance(m, Measurement)}
+    # Its first curve is the planned one, which has a label already.
+    added = dict(main)
+    for label in _curves_of(main)[:1]:
+        changed = changed | {curves[0]: added.pop(label)}
+    return changed | {label + " 2" * (label in changed): m for label, m in added.items()}
+
+
+def _curves_of(measurements: dict[str, Measurement]) -> list[str]:
+    """Return the labels of measured curves."""
+    return [label for label, m in measurements.items() if isinstance(m.data, CoolingCurve)]
 
 
 def with_curve(measurement: Measurement, **fields: Any) -> Measurement:

@@ -351,6 +351,12 @@ def _check_model(
                 f"T below 0 is compared by kinetic theory only, got {name}. Fit the curve up to "
                 "where T falls below some T_err"
             )
+        T_rot = curves[""].curve.rotational_temperature
+        if gas.surface is not None and T_rot is not None and not np.all(np.asarray(T_rot) > 0):
+            raise ValueError(
+                f"T_rot of 0 or less is compared by kinetic theory only, got {name}. Leave the "
+                "column out, or the times at which T_rot is not above 0"
+            )
         if needs_start_time:
             raise ValueError(
                 f"{START_TIME} is fitted through kinetic theory only, got {name}. Fit it by "

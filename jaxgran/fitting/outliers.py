@@ -11,10 +11,10 @@ from jaxgran.fitting.rows import CurveRows
 from jaxgran.fitting.search import Minimum, minimise
 
 CHANCE = 1e-3
-"""Probability that a curve without outliers has a residual as large."""
+"""Probability that a fit without outliers has so large a residual."""
 
-MOST = 0.1
-"""Share of the values of a curve beyond which they are not outliers but a misfit."""
+LARGEST_SHARE = 0.1
+"""Largest share of the values that is left out; more are a misfit of the model."""
 
 
 class Value(NamedTuple):
@@ -22,8 +22,8 @@ class Value(NamedTuple):
 
     Attributes:
         label: of the measurement.
-        time: its place among the times.
-        column: 0 of T, 1 of T_rot.
+        time: index of its time.
+        column: 0 for T, 1 for T_rot.
     """
 
     label: str
@@ -38,23 +38,25 @@ def without_outliers(
 
     Args:
         problem: of a fit.
-        first: the first guess of a fit, which far outliers lead astray.
+        first: first guess of the unknowns: outliers may have led an earlier fit astray.
         max_steps: of each search.
 
     Returns:
-        The problem without them, where its search ends, and the values that were left out.
+        The problem without them, where its search ends, and the values that were left out. Without
+        any nothing is searched: the end is the first guess.
     """
-    count = sum(m.num_points for m in problem.curves)
+    count = sum(int(np.sum(m.used)) for m in problem.curves)
     limit = float(scipy.stats.norm.isf(CHANCE / 2 / max(count, 1)))
     end = Minimum(first, np.inf, 0, False)
     left_out: list[Value] = []
-    while len(left_out) < MOST * count:
+    while len(left_out) < LARGEST_SHARE * count:
         worst, residual = _worst(problem, end.flat)
         if not residual > limit:
             break
-        # An outlier makes the residual of its successor large, too.
-        both = [worst, worst._replace(time=worst.time - 1)][: 1 + (worst.time > 0)]
-        ends = {x: minimise(_without(problem, x), end.flat, max_steps) for x in both}
+        # A value is expected from those before it: after an outlier the next residual is large,
+        # too, and either value may be the outlier.
+        candidates = [worst, *_predecessor(problem, worst)]
+        ends = {x: minimise(_without(problem, x), end.flat, max_steps) for x in candidates}
         value = min(ends, key=lambda x: ends[x].value)
         problem = _without(problem, value)
         end = ends[value]
@@ -62,8 +64,15 @@ def without_outliers(
     return problem, end, left_out
 
 
+def _predecessor(problem: Problem, value: Value) -> list[Value]:
+    """Return the last value in use before another one of the same quantity, if there is one."""
+    used = next(m.used for m in problem.curves if m.label == value.label)
+    earlier = np.flatnonzero(used[: value.time, value.column])
+    return [value._replace(time=int(time)) for time in earlier[-1:]]
+
+
 def _worst(problem: Problem, flat: np.ndarray) -> tuple[Value, float]:
-    """Return the value of the largest residual, and the size of the latter."""
+    """Return the value of the largest residual, and the residual over its standard deviation."""
     found = (Value("", 0, 0), 0.0)
     for row in problem.evaluate(flat).rows:
         if row.name == "curve" and row.label is not None:

@@ -430,7 +430,7 @@ def _errors_of_measurement(
     N = measurement.num_particles
     if N is not None:
         ratio = error[error > 0] / (2 / (components * N)) ** 0.5 / values[error > 0]
-        if np.all(np.abs(ratio - 1) < ERRORS_OF_PARTICLES):
+        if ratio.size and np.all(np.abs(ratio - 1) < ERRORS_OF_PARTICLES):
             notes.append(
                 f"{name} equals the fluctuation of independent samples of {N} grains and is not "
                 "used: the energy of all grains of one run fluctuates less. If these are errors of "

@@ -260,8 +260,10 @@ class Equations(NamedTuple):
             sixth = 8 / (d * (d + 2) * (d + 4)) * losses[2]
             a3_rate = 3 * a2_rate - 3 * impacts * (1 + 3 * a2 - a3) + sixth
         inelasticity = rates[0, 0] * 2 * sqrt(2 * pi) / sphere_surface(d)  # <1 - eps^2>
-        cooling = impacts * density.factor(gas.law, speed, inelasticity, moments.collisions, d)
-        relaxing, rotating = zero, []
+        factor = density.factor(gas.law, speed, inelasticity, moments.collisions, d)
+        cooling = impacts * factor
+        relaxing = zero
+        rotating = []
         if gas.has_elements:
             changes = element_rates(gas, speed, moments.spins, a2, d, self.gaussian_spins)
             cooling, relaxing = cooling + changes.cooling, changes.relaxation
@@ -273,14 +275,14 @@ class Equations(NamedTuple):
                 growth = zip(changes.spins, spins, (1, 1, 2), strict=True)
                 rotating = [change + power * cooling * x for change, x, power in growth]
                 rotating = rotating[: 1 if self.gaussian_spins else 3]
-        colliding, exchanging = collision_rate(a2, d, a3) * speed, []
+        colliding = collision_rate(a2, d, a3) * speed
+        exchanging = []
         if gas.sizes is not None:
             assert moments.size_ratio is not None
-            of_T, of_ratio, often = size_rates(gas, speed, moments.size_ratio, a2, d)
-            factor = density.factor(gas.law, speed, inelasticity, moments.collisions, d)
-            cooling = cooling - factor * of_T
-            colliding = colliding * often
-            exchanging = [of_ratio]
+            of_sizes = size_rates(gas, speed, moments.size_ratio, a2, d)
+            cooling = cooling - factor * of_sizes.impacts - of_sizes.drag
+            colliding = colliding * of_sizes.collisions
+            exchanging = [of_sizes.ratio]
         # Of the terms that cool the gas, only impacts change the shape of the velocity
         # distribution.
         rate = [
@@ -327,13 +329,29 @@ def _diffusion_rates(
     return [(first, q0), (second + coupling, q1)]
 
 
+class SizeRates(NamedTuple):
+    """What unequal sizes add to the rates of change of a gas of equal spheres.
+
+    Attributes:
+        impacts: d ln T/dt by impacts, minus that of equal spheres.
+        drag: the same by drag.
+        ratio: dq/dt.
+        collisions: number of collisions over that of equal spheres.
+    """
+
+    impacts: Float[Array, ""]
+    drag: Float[Array, ""]
+    ratio: Float[Array, ""]
+    collisions: Float[Array, ""]
+
+
 def size_rates(
     scene: ReducedScene,
     speed: Float[Array, ""],
     ratio: Float[Array, ""],
     sonine: Float[Array, ""],
     d: int,
-) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+) -> SizeRates:
     """Return what unequal sizes add to the rates of change of a gas of equal spheres.
 
     Args:
@@ -342,20 +360,20 @@ def size_rates(
         ratio: q, see `jaxgran.theory.sizes`.
         sonine: a_2.
         d: dimension.
-
-    Returns:
-        d ln T/dt without that of equal spheres, dq/dt, and the number of collisions over that of
-        equal spheres.
     """
     pairs = pair_rates(scene.sizes, speed, ratio, sonine, d)
     of_T, of_ratio = variable_changes(ratio, d) @ pairs.changes
-    of_T = of_T - equal_rates(scene.law, speed, sonine, d)
+    of_drag = jnp.zeros_like(of_T)
     if scene.drag is not None:
         drag = 2 * scene.drag.rate * drag_factors(scene.sizes)
-        of_T = of_T + 2 * scene.drag.rate - jnp.mean(drag * partial_temperatures(ratio))
+        of_drag = 2 * scene.drag.rate - jnp.mean(drag * partial_temperatures(ratio))
         of_ratio = of_ratio - drag[0] + drag[1]
-    often = pairs.impacts / (collision_rate(0.0, d) / 2 * speed)
-    return of_T, of_ratio, often
+    return SizeRates(
+        impacts=of_T - equal_rates(scene.law, speed, sonine, d),
+        drag=of_drag,
+        ratio=of_ratio,
+        collisions=pairs.impacts / (collision_rate(0.0, d) / 2 * speed),
+    )
 
 
 class ElementRates(NamedTuple):
@@ -781,6 +799,9 @@ def crowding_coefficient(gas: Gas) -> Float[Array, ""]:
     )
 
 
+MAX_IMBALANCE = 1e-3
+"""Relative difference of losses and drive above which a state is not steady."""
+
 MAX_LOG_TEMPERATURE = 60.0
 """Largest |ln T/T_0| of a steady state."""
 
@@ -814,6 +835,9 @@ def steady_state(gas: Gas) -> SteadyState:
     Args:
         gas: with a `jaxgran.WhiteNoise` drive.
 
+    Returns:
+        The state; nan under a transformation where no loss balances the drive.
+
     Raises:
         ValueError: for a gas without a drive, or a gas in which no loss balances the drive.
 
@@ -826,15 +850,17 @@ def steady_state(gas: Gas) -> SteadyState:
     """
     if gas.drive is None:
         raise ValueError("a gas without drive has no steady state: add drive=WhiteNoise(strength)")
-    log_theta, sonine, ratio, residual = _solve_steady(gas)
-    if not isinstance(residual, Tracer) and not float(residual) < 1e-3:
+    log_theta, sonine, ratio, imbalance = _solve_steady(gas)
+    is_steady = imbalance < MAX_IMBALANCE
+    if not isinstance(is_steady, Tracer) and not is_steady:
         raise ValueError(
             "the losses balance the drive at no temperature. Give the gas a drive of strength > 0, "
             "and losses: a restitution below 1, or drag"
         )
     temperature = gas.temperature * jnp.exp(log_theta)
     rotational = None if gas.surface is None else ratio * temperature
-    return SteadyState(temperature, sonine, rotational)
+    state = SteadyState(temperature, sonine, rotational)
+    return jax.tree.map(lambda x: jnp.where(is_steady, x, jnp.nan), state)
 
 
 @eqx.filter_jit

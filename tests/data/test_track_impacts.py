@@ -1,5 +1,7 @@
 """Tracks that cannot show impacts, lines through flights, and errors of the speeds of impacts."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -59,6 +61,44 @@ def test_lines_through_short_flights_of_long_tracks_keep_their_digits():
         slope = np.polyfit(t[rows] - t[first], path[rows], 1)[0]
         assert found.velocity[k, 0] == pytest.approx(slope, rel=1e-7)
         assert found.square[k] == pytest.approx(np.sum((t[rows] - t[rows].mean()) ** 2), rel=1e-7)
+
+
+def test_impacts_on_walls_are_found_wherever_they_lie_between_frames():
+    # 15 x 15 spheres move along x between two walls, and are reflected with eps = .9.
+    gas = glass_beads()
+    side = 0.062
+    room = side - float(gas.diameter)
+    frames = np.arange(400)
+    ids, times, paths = [], [], []
+    expected = 0
+    rng = np.random.default_rng(0)
+    places = np.linspace(0, room, 15)
+    for number, (y, z) in enumerate(np.array(np.meshgrid(places, places)).reshape(2, -1).T):
+        x = np.empty(frames.size)
+        speed = 0.5
+        begin, since = room * rng.random(), 0.0
+        sign = 1.0
+        t = frames / 500
+        while True:
+            until = since + ((room - begin) if sign > 0 else begin) / speed
+            inside = (t >= since) & (t < until)
+            x[inside] = begin + sign * speed * (t[inside] - since)
+            if until > t[-1]:
+                break
+            is_inner = 0 < y < room and 0 < z < room
+            expected += is_inner and 5 / 500 < until < t[-1] - 5 / 500
+            begin = room if sign > 0 else 0.0
+            since, sign, speed = until, -sign, 0.9 * speed
+        ids.append(np.full(frames.size, number))
+        times.append(t)
+        paths.append(np.stack([x, np.full_like(x, y), np.full_like(x, z)]))
+    names = dict(zip("xyz", np.concatenate(paths, axis=1), strict=True))
+    columns = {"id": np.concatenate(ids), "t": np.concatenate(times)} | names
+    between = dataclasses.replace(gas, container=jaxgran.Walls(side, restitution=0.9))
+    lines = list(range(columns["t"].size))
+    found = impacts_of_tracks(columns, {"localisation_error": "1e-7"}, lines, between)
+    assert found.walls is not None and found.walls.num_values >= 0.99 * expected > 500
+    np.testing.assert_allclose(found.walls.restitution, 0.9, atol=0.002)
 
 
 def test_errors_of_speeds_are_the_scatter_of_equal_impacts():

@@ -50,6 +50,14 @@ def test_the_choice_of_a_model_tells_the_error_of_a_steady_state():
 
 
 @pytest.mark.slow
+def test_a_batch_has_no_steady_state_where_nothing_is_lost():
+    gas = constant(0.9)
+    states = jax.vmap(lambda eps: jaxgran.steady_state(gas.replace(coefficient=eps)))
+    T = states(jnp.asarray([0.9, 1.0])).temperature
+    assert T[0] == pytest.approx(float(jaxgran.steady_state(gas).temperature)) and jnp.isnan(T[1])
+
+
+@pytest.mark.slow
 def test_the_steady_state_is_where_theory_comes_to_rest():
     gas = constant(0.5)
     steady, curve = jaxgran.steady_state(gas), theory_curve(gas, LATE, rtol=1e-10)

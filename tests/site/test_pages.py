@@ -39,11 +39,18 @@ PRINTED = {
     "laws": "0.972",
     "models": "two replicas (2, 100, 3) True",
 }
+LONG = "plan", "scenes", "sharp_bits", "derivatives", "models", "laws"
+"""Pages whose code runs for a minute or more."""
+WITH_CODE = [
+    pytest.param(name, marks=[pytest.mark.minutes] if name in LONG else [])
+    for name, text in TEXTS.items()
+    if "```python" in text
+]
 FETCHED = r"""<(?:script|link|img|iframe)\b[^>]*(?:src|href)=["']?(?:https?:)?//"""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name, text in TEXTS.items() if "```python" in text])
+@pytest.mark.parametrize("name", WITH_CODE)
 def test_the_code_of_a_page_runs_as_pasted(name, run, tmp_path):
     printed = run("-c", RUN, PAGES / f"{name}.md")
     assert PRINTED.get(name, "") in printed, printed
