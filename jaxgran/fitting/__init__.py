@@ -3,8 +3,10 @@
 - `fit`: the public function `fit`, the checks of its arguments and warnings.
 - `setup`: what a user asks for, as a `problem` with a first guess: `rows` are the measured values,
   `parameters` the unknowns on an unconstrained scale.
-- `prediction`, `likelihood`: a measured curve beside its prediction, and -2 ln L of the two.
-- `search`: the maximum of the likelihood; `simulations`: the same for stochastic models.
+- `prediction`, `comparison`, `likelihood`: a curve by a model with its derivatives, its residuals,
+  and -2 ln L.
+- `search`: the maximum of the likelihood; `simulations`: the same for stochastic models, and
+  `simulated_fit` its result.
 - `estimate`, `result`: the estimate with its errors by cause (`information`), and `Fit`.
 - `goodness`, `outliers`: tests of the fit, and far values.
 - `alternatives`: alternative explanations of a curve, and the range of the parameters over them.

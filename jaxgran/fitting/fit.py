@@ -27,7 +27,8 @@ from jaxgran.fitting.result import Fit
 from jaxgran.fitting.rows import unused_displacements, unused_rotation
 from jaxgran.fitting.search import Descent, is_transformation
 from jaxgran.fitting.setup import Request
-from jaxgran.fitting.simulations import MAX_LINEARISED, fit_through_simulations
+from jaxgran.fitting.simulated_fit import fit_through_simulations
+from jaxgran.fitting.simulations import MAX_LINEARISED
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_gas, checked_key, checked_model
 from jaxgran.models.kinetic_theory import KineticTheory
