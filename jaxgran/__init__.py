@@ -67,8 +67,8 @@ from jaxgran.scene.laws import RestitutionSpline as RestitutionSpline
 from jaxgran.scene.laws import Viscoelastic as Viscoelastic
 from jaxgran.scene.laws import viscoelastic_restitution as viscoelastic_restitution
 from jaxgran.sweep import sweep as sweep
-from jaxgran.theory.equations import SteadyState as SteadyState
-from jaxgran.theory.equations import steady_state as steady_state
+from jaxgran.theory.steady_states import SteadyState as SteadyState
+from jaxgran.theory.steady_states import steady_state as steady_state
 
 __all__ = [
     "Alternative",

@@ -11,7 +11,7 @@ largest error (Lawson's reweighting of a linearised least-squares fit). Prints t
 derive_softness: soft contacts slow the cooling by c(beta) contact durations over mean free times.
 Solves the equation of motion of an impact in the variables of `jaxgran.scene.contact.impact`, with
 its derivative in an outward acceleration, the centrifugal one of an oblique impact. Prints
-c/(d - 1) at some beta, the coefficients of `jaxgran.theory.equations` and the largest relative
+c/(d - 1) at some beta, the coefficients of `jaxgran.theory.density` and the largest relative
 error of the fit, and draws both.
 """
 
@@ -26,7 +26,7 @@ from experiments.support.plots import GUIDE, INK, THEORY, VISCOELASTIC, caption,
 from experiments.support.record import Options, run_parts
 from jaxgran.scene.contact import impact
 from jaxgran.scene.laws import C1, viscoelastic_restitution
-from jaxgran.theory.equations import MEAN_OVERLAP, softness_coefficient
+from jaxgran.theory.density import MEAN_OVERLAP, softness_coefficient
 
 ROUNDS = 300
 BETAS = np.geomspace(1e-3, 8.0, 40)

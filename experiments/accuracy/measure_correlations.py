@@ -5,7 +5,7 @@
 Hard spheres of constant restitution start from an elastic fluid and cool in boxes shorter than L_c.
 Their cooling rate over Enskog's, with a_2 and a_3 of kinetic theory, is measured in each box from
 T^(-1/2), which grows at a constant rate in Enskog's theory, and compared with
-`jaxgran.theory.equations` and `jaxgran.models.error_model`. For elastic spheres the collision rate
+`jaxgran.theory.density` and `jaxgran.models.error_model`. For elastic spheres the collision rate
 over Enskog's is measured; its difference from 1 is a property of equilibrium and is divided out.
 The rates are corrected for finite N: without total momentum spheres collide faster, few spheres
 share the energy, and T^(-1/2) is not linear in it. The corrections are ``1/(2N) - 3/(4dN) +
@@ -31,7 +31,7 @@ from experiments.support.plots import DSMC, ELASTIC, HARD, INK, THEORY, caption,
 from experiments.support.record import Options, run_parts
 from experiments.support.scenes import cool, hard_beads, times_of
 from jaxgran.models.error_model import flow_share
-from jaxgran.theory.equations import correlation_build_up, correlation_slowdown
+from jaxgran.theory.density import correlation_build_up, correlation_slowdown
 
 MARKS = np.array([0.0, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0])
 """Collisions per particle at which T is recorded."""

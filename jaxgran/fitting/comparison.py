@@ -23,7 +23,8 @@ FLOOR = "floor"
 """Noise floor, m^2/s^2, added to the computed T: a parameter of an alternative explanation."""
 
 WHITE = "white"
-"""Relative standard deviation of further independent errors of T: another one."""
+"""Relative standard deviation of further independent errors of T: a parameter of an alternative
+explanation, too."""
 
 DIFFERENCE = float(np.finfo(float).eps ** 0.25)
 """Step of central differences in an unconstrained parameter."""
@@ -82,7 +83,7 @@ class Comparison:
     def whiten(
         self, columns: Float[np.ndarray, "values columns"]
     ) -> Float[np.ndarray, "values columns"]:
-        """Return columns of residuals as independent ones of unit variance.
+        """Return residuals that the likelihood makes independent, of variance 1.
 
         Args:
             columns: of ln T at all times, followed by ln T_rot.
@@ -128,7 +129,8 @@ class Comparison:
             of_value = (values[up] - values[down]) / (2 * DIFFERENCE)
             of_log_variance = np.log(variances[up] / variances[down]) / (2 * DIFFERENCE)
             of_change = (changes[up] - changes[down]) / (2 * DIFFERENCE)
-            # Where T is compared, slopes become those of (y - T)/error, and log_slopes 0.
+            # What -2 ln L gains where T is compared in place of ln T is shared between both, so
+            # that slopes become those of (y - T)/error there, and log_slopes 0.
             slopes[:, element.place] = of_value / error + 0.5 * whitened * of_change
             log_slopes[:, element.place] = of_log_variance + of_change
         log_variance = np.log(variances[0]) + changes[0]

@@ -41,7 +41,7 @@ from jaxgran.theory.covariance import (
     run_process,
     transposed,
 )
-from jaxgran.theory.equations import Spins
+from jaxgran.theory.moments import Spins
 from jaxgran.theory.sizes import energy_ratio, energy_slope
 
 RATE_ERROR_LENGTH = 1.0
@@ -70,7 +70,7 @@ LAW_CONSTANTS = ("dissipative_constant", "coefficient", "drops")
 """Parameters of laws that `guess_from_data` knows."""
 
 SMALLEST_VARIANCE = 1e-12
-"""Variance of a value that is given without an error and has none by theory, relative."""
+"""Relative variance that is added to each value, so that exact ones do not divide by 0."""
 
 
 class Nodes(NamedTuple):
@@ -85,9 +85,9 @@ class Nodes(NamedTuple):
         rotation: T_rot/T; 0 for smooth spheres.
         sonine: a_2, shape (nodes,).
         collisions: per particle.
-        size_ratio: q of spheres of unequal sizes (`jaxgran.theory.sizes`); None of equal ones.
-        by_size_ratio: derivative of the logarithm of the measured T in q: 0 unless it is the
-            temperature by the energy; None for equal spheres.
+        size_ratio: q of spheres of unequal sizes (`jaxgran.theory.sizes`); None for equal spheres.
+        by_size_ratio: derivative of ln T in q, for the measured T: 0 unless T is given by the
+            energy; None for equal spheres.
     """
 
     times: Any
@@ -256,9 +256,9 @@ def _run_filter(
         mean = mean + jnp.sum(change[:, :, None] * mean[None], axis=1)
         moved = covariance + product(change, covariance)
         covariance = moved + product(moved, transposed(change)) + increment
-        # T is that of the gas, with the sampling error; ln T_rot is ln T + ln(T_rot/T).
+        # Measured: ln T of the gas with the sampling error, and ln T_rot = ln T + ln(T_rot/T).
         of_T = share * unit[0] + unit[sample]
-        if by_size is not None:  # that of their energy depends on the ratio of temperatures, too
+        if by_size is not None:  # T by the energy also depends on q
             of_T = of_T + share * by_size * unit[1]
         of_rotation = unit[0] + by_rotation * unit[1]
         state = mean, covariance

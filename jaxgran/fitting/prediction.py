@@ -22,8 +22,8 @@ from jaxgran.scene.gas import Gas
 from jaxgran.theory.sizes import energy_ratio, energy_slope
 
 MAX_LINE_BEFORE = 1.9
-"""Largest ratio of the power of T that is a straight line, to that at the start, which is continued
-to times before the start: its continuation is .1 then, and T_0 over it diverges."""
+"""Largest value of the line ``(T(t)/T(0))^-p`` that is continued before the start, to 2 minus its
+value: at 2 the continued T diverges."""
 
 TINY = float(np.finfo(np.float32).tiny)
 
@@ -55,8 +55,8 @@ class Prediction(NamedTuple):
         compared: ln T and ln T_rot that are compared with the data, shape (nodes, 2).
         displacement: ln <dr^2>, shape (nodes,).
         parameters: of the gas, by name.
-        size_ratio: q of spheres of unequal sizes, shape (nodes,); None of equal ones.
-        scatter: logarithm of the scatter.
+        size_ratio: q of spheres of unequal sizes, shape (nodes,); None for equal spheres.
+        scatter: logarithm of the scatter of N grains over what theory gives.
     """
 
     log_T: np.ndarray
@@ -73,8 +73,7 @@ class Prediction(NamedTuple):
 class _Continuation:
     """Logarithms of temperatures, continued to times before the start.
 
-    A power of T is nearly a straight line in time. At a time -t before the start this line is at
-    ``2 - line(t)``, relative to its value at the start.
+    A power of T is nearly a straight line in time: ``(T(-t)/T(0))^-p = 2 - (T(t)/T(0))^-p``.
 
     Attributes:
         logs: ln T and ln T_rot at the times |t|, the first of which is 0.
@@ -88,7 +87,7 @@ class _Continuation:
 
     @cached_property
     def line(self) -> Float[np.ndarray, "nodes 2"]:
-        """The straight line at |t|, over its value at the start."""
+        """``(T(t)/T(0))^-p`` at |t|."""
         line = np.exp(-self.power * (self.logs - self.logs[:1]))
         return np.minimum(line, MAX_LINE_BEFORE)
 
@@ -130,7 +129,7 @@ class _ExpandedCurve:
 
     @cached_property
     def size_ratio(self) -> Float[np.ndarray, "nodes"] | None:
-        """q of spheres of unequal sizes; None of equal ones."""
+        """q of spheres of unequal sizes; None for equal spheres."""
         if "size_ratio" not in self.linear.values:
             return None
         return np.log(self.value("size_ratio"))
@@ -313,7 +312,10 @@ def predicted_curve(
 def steady_curve(
     model: AbstractModel, gas: Gas, times: np.ndarray, names: Collection[str], tolerance: float
 ) -> LinearisedCurve:
-    """Return a curve of the shape of `linearise`, of a gas that does not cool."""
+    """Return a curve of a gas that does not cool, in place of `linearise`.
+
+    Its shapes are those of a computed curve: they compile the programs that come after one.
+    """
     one = np.ones_like(times)
     values = {"temperature": one, "sonine": one, "collisions": times / times[-1]}
     if gas.diameter_sd is not None:
@@ -322,7 +324,7 @@ def steady_curve(
 
 
 def spread_of(gas: Gas) -> np.ndarray:
-    """Return `Gas.size_spread`; of many gases shape (1, gases)."""
+    """Return `Gas.size_spread`; for many gases with a first axis of nodes, shape (1, gases)."""
     spread = np.asarray(gas.size_spread)
     return spread[None] if spread.ndim else spread
 

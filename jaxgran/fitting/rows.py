@@ -38,8 +38,8 @@ DISPLACEMENT = "model of <dr^2>"
 """The same of the diffusive part of <dr^2>."""
 
 MAX_LOG_STEP = 0.25
-"""Longest step between two times at which a curve is computed, in ln(1 + t/tau_c): T falls by .4 in
-its logarithm."""
+"""Longest step between two times at which a curve is computed, in ln(1 + t/tau_c): ln T falls by at
+most .4 in a step."""
 
 TINY = float(np.finfo(np.float32).tiny)
 
@@ -51,7 +51,7 @@ WEAK_SCATTER = 1.5
 more may be any number."""
 
 UNKNOWN_NUMBER = 1e3
-"""N about which it is searched then."""
+"""First guess of N where it is not known."""
 
 SCATTER_ERROR = 0.05
 """Relative error of the variance that theory gives to a run of N grains."""

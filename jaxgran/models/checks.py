@@ -17,7 +17,7 @@ from jaxgran.models.scales import scales_at
 from jaxgran.scene.elements import VOLUME_TOLERANCE, container_volume_ratio
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import MIN_BOX, PACKING_LIMIT
-from jaxgran.theory.equations import max_thermal_speed
+from jaxgran.theory.steady_states import max_thermal_speed
 
 CONTACT_LIMIT = 0.03
 """Contact duration over mean free time above which impacts are not instantaneous and binary."""

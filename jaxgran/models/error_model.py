@@ -34,7 +34,7 @@ CORRELATED_ERROR = {2: (0.003, 0.045), 3: (0.003, 0.02)}
 
 Measured by `experiments/accuracy/measure_correlations.py --full`: in 3D the error is at most .4 %
 at phi = .05 and .1, .5 % at .2 and .9 % at .3, in 2D .5, .4, .8 and 1.7 %, each at eps = .8, a
-value to which nothing was fitted. `jaxgran.theory.equations` has the rate.
+value to which nothing was fitted. `jaxgran.theory.density` has the rate.
 """
 
 CONTACT_ERROR = 0.3

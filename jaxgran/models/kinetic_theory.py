@@ -26,14 +26,10 @@ from jaxgran.models.error_model import ErrorModel
 from jaxgran.models.scales import first_cooling_rate
 from jaxgran.scene.gas import Gas, reduced_scene
 from jaxgran.theory.covariance import run_covariance
-from jaxgran.theory.equations import (
-    SUPPORTED,
-    Density,
-    Equations,
-    Moments,
-    SceneAndDensity,
-    softness_factor,
-)
+from jaxgran.theory.density import Density, softness_factor
+from jaxgran.theory.elements import SUPPORTED
+from jaxgran.theory.equations import Equations, SceneAndDensity
+from jaxgran.theory.moments import Moments
 from jaxgran.theory.solver import MomentSolver, padded_length
 
 TOLERANCES = validation.Domain(0.0, 0.1)
@@ -85,7 +81,7 @@ class KineticTheory(AbstractModel):
     3 a_2 - a_3) + 8 mu_6/(d(d+2)(d+4))``, ``d<dr^2>/dt = 2 d D``, ``dN/dt = nu``, and two moments
     of labelled velocities for D, the first ``dD/dt = T - nu_v D``. All but T start from 0, and the
     averages over impacts are exact in eps(v) (`jaxgran.theory.averages.impact_moments`). c and k
-    correct for contacts that last, h for correlated velocities (`jaxgran.theory.equations`).
+    correct for contacts that last, h for correlated velocities (`jaxgran.theory.density`).
     The theory leaves out clustering: it holds in boxes below L_c with short contacts. The averages
     assume that eps(v) is smooth: for a law with a kink, such as an eps capped at 1, use
     `jaxgran.DSMC`; T of ice, which becomes elastic at low speed, is 3 % off after some 1e5 mean

@@ -2,7 +2,7 @@
 
 Fits, diagnoses and the choice of a model call this program for all curves of a kind of gas: times
 are padded to a grid of lengths, and a gas that lacks an element gets one without effect, so that
-alternative explanations of a curve are other numbers of the same program.
+alternative explanations of a curve differ only in the inputs of the program.
 """
 
 import dataclasses
@@ -52,8 +52,8 @@ class LinearisedCurve(NamedTuple):
 def with_neutral_elements(gas: Gas, model: AbstractModel) -> Gas:
     """Return a gas with each element that the model supports; those added have no effect.
 
-    An element of an alternative explanation is then another number of the program that computed the
-    fitted curve, and not another program, which would take seconds to compile. Spheres of unequal
+    An alternative explanation with one more element then differs only in the inputs of the program
+    that computed the fitted curve: nothing is compiled again. Spheres of unequal
     sizes get drag alone, since no theory of them has roughness and walls.
     """
     neutral = {
@@ -132,7 +132,7 @@ def _directions(gas: Gas, sizes: dict[str, int]) -> tuple[Gas, np.ndarray]:
     fields = gas._parameter_fields
     begin = 1
     for name, size in sizes.items():
-        numbers = fields[name].get(along).reshape(count, size)
+        numbers = fields[name].get(along).reshape(count, size)  # a view: this changes `along`
         numbers[np.arange(begin, begin + size), np.arange(size)] = 1.0
         begin += size
     return along, np.eye(1, count)[0].astype(jnp.result_type(float))

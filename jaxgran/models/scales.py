@@ -13,7 +13,7 @@ from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import NODES
 from jaxgran.scene.laws import Viscoelastic
 from jaxgran.theory.averages import mean_inelasticity
-from jaxgran.theory.equations import softness_factor
+from jaxgran.theory.density import softness_factor
 
 MAX_CHECKED_SPEED = 3.7
 """Normal speed, over sqrt(2 T), that a thousandth of the impacts of a gas exceed."""

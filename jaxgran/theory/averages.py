@@ -449,7 +449,7 @@ def rough_energy_moments(
 
 
 ElementBounds = tuple[ArrayLike, ArrayLike, ArrayLike | None, ArrayLike | None]
-"""Bounds of the effects of elements on T: `jaxgran.theory.equations.element_bounds`."""
+"""Bounds of the effects of elements on T: `jaxgran.theory.elements.element_bounds`."""
 
 _SCAN_POINTS = 16
 """Temperatures at which the cooling rate is computed to determine the range of a `RateTable`."""

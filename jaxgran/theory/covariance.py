@@ -50,7 +50,9 @@ from jaxgran.theory.averages import (
     loss_nodes,
     rough_energy_moments,
 )
-from jaxgran.theory.equations import Density, Spins, coulomb_limit, mean_kick
+from jaxgran.theory.density import Density
+from jaxgran.theory.elements import coulomb_limit, mean_kick
+from jaxgran.theory.moments import Spins
 from jaxgran.theory.sizes import (
     PairRates,
     drag_factors,
@@ -201,7 +203,7 @@ def wall_impacts(
     """Return the impacts on all walls at a speed sqrt(T/T_0).
 
     Friction at a wall takes from one sphere what friction between two spheres with half the eta
-    takes from both (`jaxgran.theory.equations`).
+    takes from both (`jaxgran.theory.elements`).
     """
     g, weights = loss_nodes(speed)
     eps = walls.law.restitution(g * speed / sqrt(2))

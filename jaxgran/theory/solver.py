@@ -25,7 +25,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran._utils import status
-from jaxgran.theory.equations import Equations, Moments, SceneAndDensity
+from jaxgran.theory.equations import Equations, SceneAndDensity
+from jaxgran.theory.moments import Moments
 
 FIRST_STEP = 0.01
 """First step, before the error of a step is known; it is shortened where it is too long."""

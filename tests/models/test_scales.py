@@ -6,7 +6,7 @@ import pytest
 
 from jaxgran.models.scales import scales_at
 from jaxgran.theory.averages import impact_moments
-from jaxgran.theory.equations import softness_factor
+from jaxgran.theory.density import softness_factor
 from tests.beads import glass_beads, hard_gas
 
 

@@ -13,7 +13,9 @@ from jaxgran.models.linearise import with_neutral_elements
 from jaxgran.scene.gas import reduced_scene
 from jaxgran.theory import covariance
 from jaxgran.theory.averages import loss_moments, rough_energy_moments
-from jaxgran.theory.equations import Density, Spins, element_rates
+from jaxgran.theory.density import Density
+from jaxgran.theory.elements import element_rates
+from jaxgran.theory.moments import Spins
 from tests.beads import glass_beads, hard_gas, without
 
 THEORY = jaxgran.KineticTheory(corrections=without("softness", "correlations"))
