@@ -17,17 +17,18 @@ LAST_STEP = 0.01
 """Length of a Newton step, in standard errors, below which a search ends."""
 
 CONVERGED_STEP = 0.03
-"""The same below which a search that ends has converged."""
+"""Length of the last Newton step, in standard errors, up to which a search has converged."""
 
 STALLED_STEP = 0.3
-"""The same where no step along it lowers -2 ln L: at a kink, where a measured point passes t0."""
+"""The same of a search in which no step lowers -2 ln L: it stalls at a kink, where a measured point
+passes t0."""
 
 MAX_STALLED = 6
 """Number of steps in succession that lower -2 ln L by less than `MIN_FALL_OF_STEP`, after which a
 search ends."""
 
 MIN_FALL_OF_STEP = 1e-4
-"""Fall of -2 ln L that has no meaning."""
+"""Largest fall of -2 ln L that counts as round-off."""
 
 MAX_STEP = 1.0
 """Length of the first step of the unconstrained parameters: a factor e of a positive one."""
@@ -47,8 +48,8 @@ MULTIMODAL_STARTS = (-0.6, 0.0, 0.6)
 """Further values of it from which a search starts."""
 
 MAX_GROWTH = 10.0
-"""Ratio of -2 ln L above its first value to the number of residuals, at which a descent is taken to
-diverge."""
+"""A descent diverges where -2 ln L exceeds its first value by this number for each residual, and
+twice this value."""
 
 WINDOW = 20
 """Number of steps whose mean loss is compared with that of as many steps before; a descent with
@@ -328,5 +329,6 @@ def _has_ceased(losses: list[float], noisy: bool) -> bool:
     if len(losses) < 2 * WINDOW:
         return False
     before, last = np.split(np.asarray(losses[-2 * WINDOW :]), 2)
-    noise = np.std(np.diff(losses[-2 * WINDOW :])) / WINDOW**0.5  # a trend has no part in it
+    # Of differences, which a trend does not widen.
+    noise = np.std(np.diff(losses[-2 * WINDOW :])) / WINDOW**0.5
     return bool(abs(before.mean() - last.mean()) < noise)

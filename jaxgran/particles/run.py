@@ -55,12 +55,17 @@ CHECKPOINT_SECONDS = 60.0
 """Time between checkpoints; one more is written when a run is interrupted."""
 
 MAX_ROWS_PER_PARTICLE = 100
-"""Rows per particle beyond which an array is not lengthened."""
+"""Largest length of an array that is lengthened, in rows for each particle."""
 
 MIN_SPHERES_PER_RUN = 8192
-"""Least number of spheres in a replica with which replicas run one after the other. On one core
-four replicas of 1000, 2000 and 4096 take then 1.4, 1.1 and 0.9 (hard), 1.4, 1.3 and 1.1 (soft)
-times as long as in one array."""
+"""Smallest number of spheres in a replica with which replicas run one after the other.
+
+Time of four replicas one after the other, over that of one array, on one core:
+
+    spheres     1000   2000   4096
+    hard         1.4    1.1    0.9
+    soft         1.4    1.3    1.1
+"""
 
 FULL = status.LIST_FULL.bit | status.CONTACTS_FULL.bit
 """Faults of arrays that are too short."""
@@ -480,7 +485,7 @@ _COMPILED: set[Hashable] = set()
 
 
 def described_program(process: AbstractProcess, state: Any) -> Hashable:
-    """Return what decides whether a program must be compiled."""
+    """Return a key of the compiled program: structure, shapes and dtype of its arguments."""
     leaves, structure = jax.tree.flatten((process, state))
     return structure, *(x.shape for x in leaves), leaves[-1].dtype
 
@@ -489,7 +494,8 @@ def described_program(process: AbstractProcess, state: Any) -> Hashable:
 def compiling(program: Hashable, progress: bool) -> Iterator[None]:
     """Show "compiling ..." on a terminal during the first call of a program in this process.
 
-    Without `progress` nothing is shown. The progress bar follows.
+    Without `progress` nothing is shown. The progress bar follows. Near the limit of memory maps all
+    programs of this process are dropped before.
     """
     text = "compiling ..."
     is_new = program not in _COMPILED

@@ -76,8 +76,7 @@ def waiting_time(
     """Draw the time in which a Poisson process has so many events, over the mean time.
 
     Its distribution is the gamma distribution. The cube of a normal number (Wilson & Hilferty) has
-    the same mean and variance within 1e-2 for one event, 1e-5 for ten. The mean number of the
-    events that come before the last one, in a share s of this time, is ``s (candidates - 1)``.
+    the same mean and variance within 1e-2 for one event, 1e-5 for ten.
 
     Args:
         key: of random numbers.
@@ -248,10 +247,10 @@ def change_subsets(
 
     Args:
         particles: the particles of the replica.
-        first: number of the first subset; they follow each other periodically.
+        first: index of the first subset; they follow each other periodically.
         count: number of subsets.
-        largest: the largest such number of all replicas, which share the loop.
-        change: a function of the number of the subset, rows of particles and a mask of those that
+        largest: largest `count` of all replicas, which share the loop.
+        change: a function of the index of the subset, rows of particles and a mask of those that
             belong to the subset. It returns the changed rows and the sums.
         zero: sums without changes.
     """
@@ -261,7 +260,7 @@ def change_subsets(
 
     def change_one(i: Int[Array, ""], carry: tuple[Array, Sums]) -> tuple[Array, Sums]:
         particles, sums = carry
-        index = ((first + i) & (2**30 - 1)) % parts
+        index = ((first + i) & (2**30 - 1)) % parts  # >= 0 where the sum overflows, too
         begin = index * n // parts
         end = (index + 1) * n // parts
         top = jnp.minimum(begin, n - size)
