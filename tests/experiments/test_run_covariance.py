@@ -8,7 +8,10 @@ import pytest
 from experiments.accuracy import run_covariance as runs
 
 STORED = np.load(runs.STORED)
-STORED_RUNS = sorted({"/".join(name.split("/")[:2]) for name in STORED})
+STORED_RUNS = [
+    pytest.param(name, marks=[pytest.mark.slow] if "rough" in name or "sliding" in name else [])
+    for name in sorted({"/".join(name.split("/")[:2]) for name in STORED})
+]
 
 
 def assert_scatters_as_theory(white, walls):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from functools import partial
 
 import jax
 import numpy as np
@@ -143,12 +144,13 @@ def test_errors_that_are_too_large_are_named():
 
 # --- elements that the fit is not told of
 
+slow = partial(pytest.param, marks=pytest.mark.slow)
 # Declared absent as, what it is, and what an alternative is called.
 ELEMENTS = [
     ("walls", {"container": jaxgran.Walls(0.1, restitution=0.8)}, "walls that dissipate energy"),
-    ("drag", {"drag": jaxgran.StokesDrag(0.02)}, "linear drag, as in air"),
-    ("roughness", {"surface": jaxgran.Rough(-0.9)}, "rough grains without initial rotation"),
-    ("friction", {"surface": jaxgran.Rough(0.44, friction=0.05)}, "rough grains that slide"),
+    slow("drag", {"drag": jaxgran.StokesDrag(0.02)}, "linear drag, as in air"),
+    slow("roughness", {"surface": jaxgran.Rough(-0.9)}, "rough grains without initial rotation"),
+    slow("friction", {"surface": jaxgran.Rough(0.44, friction=0.05)}, "rough grains that slide"),
 ]
 
 
@@ -189,7 +191,7 @@ def test_the_range_holds_A_where_an_element_is_not_told(absent, element, name):
     [
         ({"container": jaxgran.Walls(0.1, restitution=0.8), "drag": jaxgran.StokesDrag(0.02)},
          "linear drag, as in air", "walls that dissipate energy"),
-        ({"container": jaxgran.Walls(0.1, restitution=0.8), "surface": jaxgran.Rough(0.4)},
+        slow({"container": jaxgran.Walls(0.1, restitution=0.8), "surface": jaxgran.Rough(0.4)},
          "rough grains without initial rotation", "walls that dissipate energy"),
     ],
 )  # fmt: skip
