@@ -42,6 +42,7 @@ def test_what_makes_no_experiment_is_refused(scene, run, old, new, message):
     assert status == 2 and message in err, err
 
 
+@pytest.mark.minutes
 @pytest.mark.slow
 def test_plan_prints_a_table_and_writes_it(scene, run):
     (scene / "flight.toml").write_text(SCENE + EXPERIMENT)

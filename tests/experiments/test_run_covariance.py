@@ -56,7 +56,13 @@ def test_stored_runs_scatter_as_theory_says(name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name, kind", [("disks", "dsmc"), ("sliding", "dsmc"), ("driven", "dsmc"), ("walls .9", "hard")]
+    "name, kind",
+    [
+        ("disks", "dsmc"),
+        ("sliding", "dsmc"),
+        ("driven", "dsmc"),
+        pytest.param("walls .9", "hard", marks=pytest.mark.minutes),
+    ],
 )
 def test_runs_scatter_as_theory_says(name, kind):
     scene = runs.ALL[name]

@@ -36,6 +36,7 @@ def test_guess_uses_the_data_not_the_gas():
     assert 0.7 < value / gas.value(A) < 1.4
 
 
+@pytest.mark.minutes
 @pytest.mark.slow
 @pytest.mark.figures
 def test_intervals_cover_the_truth(record):

@@ -165,6 +165,7 @@ def test_a_law_is_learnt_from_a_curve(caplog):
         jaxgran.restitution_band(fitted(true, curve, free=("temperature",)))
 
 
+@pytest.mark.minutes
 @pytest.mark.slow  # compiles derivatives of runs
 def test_a_law_is_learnt_through_simulations():
     curve = synthetic(glass_beads(0.15), num_points=12, relative_error=0.02)

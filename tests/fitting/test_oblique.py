@@ -100,14 +100,15 @@ def test_the_published_pair_of_alumina_and_glass():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:this curve does not determine")
 def test_a_curve_with_oblique_impacts_determines_a():
     """T(t) alone does not tell roughness from A; impacts do."""
     curve = synthetic(ROUGH, jax.random.key(1), relative_error=0.02, quantities=("temperature",))
     known = {"errors_measured": True, "num_particles": 10**6}
     measured = jaxgran.Measurement(GUESS, curve, **known)
     data = {"curve": measured, "drops": of(GUESS, impacts(ROUGH, 3))}
-    with pytest.warns(UserWarning, match="A and beta_t and friction"):
-        jaxgran.fit(measured, free=NAMES, quick=True)
+    alone = jaxgran.fit(measured, free=NAMES, quick=True)
+    assert alone.standard_error[0] > 0.1 * TRUE[0] and alone.standard_error[1] > 0.2
     result = jaxgran.fit(data, free=NAMES)
     np.testing.assert_array_less(np.abs(result.estimate - TRUE) / result.standard_error, 3.5)
     assert result.standard_error[0] < 0.05 * TRUE[0] and not result.undetermined

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.fitting import simulations
+from jaxgran.fitting import simulated_fit
 from tests.beads import glass_beads, soft_beads
 from tests.fitting.curves import BOTH, A, deviation, rough_beads, synthetic
 from tests.fitting.curves import fitted as fit_measured
 
 
+@pytest.mark.minutes
 @pytest.mark.slow
 def test_T_rot_is_fitted_beside_T():
     gas = rough_beads()
@@ -30,6 +31,7 @@ def test_T_rot_is_fitted_beside_T():
     assert float(result.standard_error[1]) < 0.06
 
 
+@pytest.mark.minutes
 @pytest.mark.slow
 def test_fit_through_soft_spheres_finds_what_made_the_curve():
     gas = soft_beads(0.1, 0.3, packing_fraction=0.2)
@@ -121,7 +123,7 @@ def test_noise_of_slopes_does_not_move_the_answer(monkeypatch):
         captured.append((sims, first))
         raise Captured
 
-    monkeypatch.setattr(simulations, "_by_gauss_newton", capture)
+    monkeypatch.setattr(simulated_fit, "by_gauss_newton", capture)
     with pytest.raises(Captured):
         fitted(StandIn(noise=1e-6), first=TRUTH)
     ((sims, flat),) = captured

@@ -42,6 +42,7 @@ def test_a_curve_without_noise_gives_its_own_constant(gas, curve, of_energy):
     assert 1e-4 < error / A < 0.02
 
 
+@pytest.mark.minutes
 @pytest.mark.slow
 def test_the_likelihood_is_differentiable_in_the_spread(gas, curve):
     measured = jaxgran.CoolingCurve(np.asarray(curve.times), np.asarray(curve.temperature))

@@ -253,7 +253,7 @@ def test_elements_without_effect_change_nothing():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["smooth", "all"])
+@pytest.mark.parametrize("name", ["smooth", pytest.param("all", marks=pytest.mark.minutes)])
 def test_derivatives_agree(name):
     gas = GASES[name]
     names = {"dissipative_constant": 1e-4, "packing_fraction": 1e-4}
