@@ -78,6 +78,23 @@ def test_additions_change_what_they_say():
     assert np.isclose(thin.priors["packing_fraction"][1], 0.002)
 
 
+def test_additions_keep_the_labels_of_a_user():
+    def also_drops(measurement):
+        drops = jaxgran.DropTest([0.1, 0.2], [0.9, 0.88], [0.01, 0.01])
+        return {"flight": measurement, "drops": jaxgran.Measurement(measurement.gas, drops)}
+
+    precise = candidates.combined(also_drops, candidates.with_errors, SMOOTH)
+    assert isinstance(precise, dict) and [*precise] == ["flight", "drops"]
+    expected = candidates.with_errors(SMOOTH)
+    error = np.asarray(precise["flight"].curve.temperature_error)
+    np.testing.assert_array_equal(error, expected.curve.temperature_error)
+    # The curve is there once, whatever its label, and no drop test replaces another.
+    three = candidates.combined(candidates.with_impacts, also_drops, SMOOTH)
+    assert isinstance(three, dict) and [*three] == ["curve", "impacts", "drops"]
+    twice = candidates.combined(also_drops, also_drops, SMOOTH)
+    assert isinstance(twice, dict) and [*twice] == ["flight", "drops", "drops 2"]
+
+
 def test_additions_are_combined_in_both_orders():
     both = candidates.combined(candidates.with_impacts, candidates.with_errors, SMOOTH)
     reverse = candidates.combined(candidates.with_errors, candidates.with_impacts, SMOOTH)
