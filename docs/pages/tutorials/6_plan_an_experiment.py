@@ -60,8 +60,8 @@ jaxgran.plot_plan(plan)
 
 # %% [markdown]
 # Ten impacts tell more than a flight four times as long, because walls, rotation and viscoelastic
-# impacts cool a gas alike. We fly, and drop ten beads. Here DSMC makes the flight, with the scatter of
-# 250 beads, and the true law makes the drops.
+# impacts cool a gas alike. We fly, and drop ten beads. Here DSMC makes the flight, with the scatter
+# of 250 beads, and the true law makes the drops.
 
 # %%
 key_of_flight, key_of_errors, key_of_drops = jax.random.split(jax.random.key(3), 3)
