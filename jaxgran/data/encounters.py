@@ -219,10 +219,14 @@ def _encounters_with_walls(motion: Motion, gas: Gas, error: float) -> list[Encou
     # The container is centred on the positions.
     lower = (low + high - room) / 2
     upper = (low + high + room) / 2
+    rows = np.arange(motion.particle.size)
+    velocities = [_velocity(motion, rows, steps) for steps in (-NUM_STEPS, NUM_STEPS)]
+    # Between two frames a velocity may be reversed: their difference would depend on eps.
+    step = np.max(np.abs(velocities), axis=0) * motion.frame_time
     found = []
     for axis in range(d):
-        found.append(_encounters_with_wall(motion, axis, 1.0, lower[axis], error))
-        found.append(_encounters_with_wall(motion, axis, -1.0, upper[axis], error))
+        found.append(_encounters_with_wall(motion, step, axis, 1.0, lower[axis], error))
+        found.append(_encounters_with_wall(motion, step, axis, -1.0, upper[axis], error))
     return found
 
 
@@ -241,23 +245,25 @@ def _check_extent(
 
 
 def _encounters_with_wall(
-    motion: Motion, axis: int, sign: float, end: float, error: float
+    motion: Motion,
+    step: Float[np.ndarray, "rows d"],
+    axis: int,
+    sign: float,
+    end: float,
+    error: float,
 ) -> Encounters:
     """Return encounters of spheres with one wall.
 
     Args:
         motion: motion of the spheres.
+        step: distance between two frames along each coordinate, m.
         axis: number of the coordinate normal to the wall.
         sign: 1 for the wall at the lower end of this axis, -1 at the upper end.
         end: coordinate of centres at the wall, m.
         error: localisation error, m.
     """
     height = sign * (motion.position[:, axis] - end)
-    row = np.arange(height.size)
-    speeds = [_velocity(motion, row, steps)[:, axis] for steps in (-NUM_STEPS, NUM_STEPS)]
-    # Within one step the velocity may be reversed: a difference of neighbours would depend on eps.
-    step = np.max(np.abs(speeds), axis=0) * motion.frame_time
-    near = np.flatnonzero(height <= step / 2 + NUM_SIGMAS * error)
+    near = np.flatnonzero(height <= step[:, axis] / 2 + NUM_SIGMAS * error)
     row = near[_closest_frames(motion.particle[near], motion.frame[near], height[near])]
     shift = np.zeros((row.size, motion.num_coordinates))
     shift[:, axis] = end
@@ -269,5 +275,5 @@ def _encounters_with_wall(
         shift=shift,
         normal=normal,
         time=motion.time[row],
-        half_width=_half_width(step[row], error),
+        half_width=_half_width(step[row, axis], error),
     )

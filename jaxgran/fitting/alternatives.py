@@ -288,9 +288,8 @@ def compare_alternatives(
     law = summary.build(None, [[base] for base in bases])
     singles = {kind: summary.build(kind, found, law) for kind, found in profiles.items()}
     alternatives = [*singles.values()]
-    for pair, found in pairs.items():
-        assert first is not None
-        alternatives.append(summary.build(pair, found, singles[first]))
+    if first is not None:
+        alternatives += [summary.build(pair, x, singles[first]) for pair, x in pairs.items()]
     best_first = sorted(alternatives, key=lambda alternative: -alternative.improvement)
     return Explanations(law, tuple(best_first))
 
@@ -343,9 +342,14 @@ def _with_free_amplitude(
 ) -> tuple[Problem, Trial | None]:
     """Return the problem with an element whose amplitude is an unknown, and its fit."""
     name = kind.parameters[0]
-    values = {m.label: dict(kind.values(at_best.amplitude, m.label)) for m in problem.curves}
-    unknowns = [Unknown(name, m.label, (), domain_of(m.gas, name)) for m in problem.curves]
-    start = [u.domain.to_free(values[u.label or ""].pop(name)) for u in unknowns]
+    # A law of impacts is that of drop tests, too; other elements belong to each curve.
+    owners = problem.measurements if kind.changes_law else problem.curves
+    values = {m.label: dict(kind.values(at_best.amplitude, m.label)) for m in owners}
+    first = {m.label: values[m.label].pop(name) for m in owners}
+    domain = domain_of(problem.curves[0].gas, name)
+    labels = [None] if kind.changes_law else [m.label for m in problem.curves]
+    unknowns = [Unknown(name, label, (), domain) for label in labels]
+    start = [domain.to_free(x) for x in first.values()][: len(labels)]
     changed = _with_rate_error(problem, kind.rate_error(at_best.amplitude))
     both = replace(changed, unknowns=(*problem.unknowns, *unknowns), fixed=values)
     return both, _trial(both, 0.0, np.append(at_best.flat, start))

@@ -56,8 +56,8 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
     share = measurement_share(problem, problem.evaluate(best.flat))
     if result.p_value < SIGNIFICANCE / 2 and not request.quick and not distant:
         notes += _outlier_notes(problem, first, max_steps)
-    scatter = problem.scatter_of_eps(problem.values(best.flat))
-    if scatter > 0:
+    scatter = problem.evaluate(best.flat).scatter_of_eps
+    if scatter is not None:
         notes = [*notes, say("scatter of eps", scatter=scatter)]
     return with_messages(request, result, explanations, notes, share)
 

@@ -314,7 +314,7 @@ def steady_curve(
 ) -> LinearisedCurve:
     """Return a curve of a gas that does not cool, in place of `linearise`.
 
-    Its shapes are those of a computed curve: they compile the programs that come after one.
+    It has the shapes of a computed curve, for which the programs after it are compiled.
     """
     one = np.ones_like(times)
     values = {"temperature": one, "sonine": one, "collisions": times / times[-1]}

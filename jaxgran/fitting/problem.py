@@ -20,7 +20,6 @@ from jaxgran.fitting.parameters import (
     halving_time,
     prior_residuals,
     residuals_and_slopes,
-    with_parameters,
 )
 from jaxgran.fitting.prediction import Element, PredictedCurve, predicted_curve, steady_curve
 from jaxgran.fitting.rows import CurveRows, DropRows
@@ -37,6 +36,8 @@ class Evaluation(NamedTuple):
         information: half of its expected second derivatives.
         rows: the residuals.
         curves: the computed curves at the times of the data, dictionaries of their fields.
+        scatter_of_eps: standard deviation of eps that impacts of two spheres show; None without
+            such impacts.
     """
 
     value: float
@@ -44,6 +45,7 @@ class Evaluation(NamedTuple):
     information: Float[np.ndarray, "unknowns unknowns"]
     rows: list[Residuals]
     curves: dict[str, dict[str, Any]]
+    scatter_of_eps: float | None = None
 
     @property
     def is_finite(self) -> bool:
@@ -215,15 +217,20 @@ class Problem:
         def add(name: str, label: str | None, row: Any, slopes: Any, is_prior: bool = True) -> None:
             rows.append(_of_unit_variance(name, label, row, slopes, elements, is_prior))
 
-        for m in self.measurements:
+        impacts = [
+            (m, _compared_impacts(m, values[m.label]))
+            for m in self.measurements
+            if isinstance(m, DropRows)
+        ]
+        for m, found in impacts:
+            slopes = {name: x / found.widening[:, None] for name, x in found.slopes.items()}
+            add("drop test", m.label, found.residuals / found.widening, slopes, is_prior=False)
+            rows[-1] = rows[-1]._replace(log_variance=2 * np.log(found.widening))
+        scatter = _common_scatter(impacts)
+        for m in self.curves:
             own = values[m.label]
-            if isinstance(m, DropRows):
-                row, slopes, widening = _of_impacts(m, own)
-                add("drop test", m.label, row / widening, slopes, is_prior=False)
-                rows[-1] = rows[-1]._replace(log_variance=2 * np.log(widening))
-                continue
-            if "spread" in m.gas.domains:
-                own = {"spread": self.scatter_of_eps(values)} | own
+            if scatter is not None and "spread" in m.gas.domains:
+                own = {"spread": scatter} | own
             curve = self._curve(m, flat, own, elements)
             rows += Comparison(curve, sources).residuals(len(elements))
             curves[m.label] = curve.fields
@@ -235,25 +242,7 @@ class Problem:
             gas = next(m.gas for m in self.measurements if m.label == at)
             for name, (row, slopes) in prior_residuals(priors, gas, values[at]).items():
                 add(name, label or None, row, slopes)
-        return summed(rows, curves)
-
-    def scatter_of_eps(self, values: dict[str, dict[str, Any]]) -> float:
-        """Return the standard deviation of eps that impacts of two spheres show; 0 without them.
-
-        Args:
-            values: SI values of the parameters, by label and name.
-        """
-        squares = []
-        numbers = []
-        for m in self.measurements:
-            if not isinstance(m, DropRows) or m.data.onto != SPHERE or not m.data.scatters:
-                continue
-            floats = _floats_of(m, values[m.label])
-            residuals = np.asarray(m.data.residuals(with_parameters(m.gas, floats)))
-            scatter, _ = m.scatter(floats, residuals)
-            squares.append(scatter**2)
-            numbers.append(m.num_points)
-        return float(np.average(squares, weights=numbers) ** 0.5) if squares else 0.0
+        return summed(rows, curves)._replace(scatter_of_eps=scatter)
 
     def compile_innovations(self, flat: np.ndarray) -> None:
         """Compile what an evaluation needs apart from the curves, whatever these are."""
@@ -279,19 +268,37 @@ class Problem:
         return curve
 
 
-def _floats_of(m: DropRows, values: dict[str, Any]) -> dict[str, Any]:
-    return {name: jnp.asarray(x) for name, x in values.items() if name in m.gas.domains}
+class _ComparedImpacts(NamedTuple):
+    """Measured impacts beside those of a gas.
+
+    Attributes:
+        residuals: measured minus computed values over their errors, shape (values,).
+        slopes: derivatives of the residuals in SI values, by parameter.
+        scatter: standard deviation of eps from impact to impact.
+        widening: factor by which this widens each error, shape (values,).
+    """
+
+    residuals: np.ndarray
+    slopes: dict[str, Any]
+    scatter: float
+    widening: np.ndarray
 
 
-def _of_impacts(
-    m: DropRows, values: dict[str, Any]
-) -> tuple[np.ndarray, dict[str, Any], np.ndarray]:
-    """Return residuals of impacts over their errors, their slopes, and what widens the errors."""
-    floats = _floats_of(m, values)
-    row, slopes = residuals_and_slopes(m.data.residuals, m.gas, floats)
-    row = np.asarray(row)
-    widening = m.widening(floats, row)
-    return row, {name: x / widening[:, None] for name, x in slopes.items()}, widening
+def _compared_impacts(m: DropRows, values: dict[str, Any]) -> _ComparedImpacts:
+    floats = {name: jnp.asarray(x) for name, x in values.items() if name in m.gas.domains}
+    residuals, slopes = residuals_and_slopes(m.data.residuals, m.gas, floats)
+    residuals = np.asarray(residuals)
+    scatter = m.scatter(floats, residuals)
+    return _ComparedImpacts(residuals, slopes, scatter, m.widening(floats, scatter))
+
+
+def _common_scatter(impacts: list[tuple[DropRows, _ComparedImpacts]]) -> float | None:
+    """Return the standard deviation of eps over all impacts of two spheres whose eps scatters."""
+    found = [(m, x) for m, x in impacts if m.data.onto == SPHERE and m.data.scatters]
+    if not found:
+        return None
+    squares = [x.scatter**2 for _, x in found]
+    return float(np.average(squares, weights=[m.num_points for m, _ in found]) ** 0.5)
 
 
 def _of_unit_variance(

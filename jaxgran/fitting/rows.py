@@ -251,11 +251,8 @@ class DropRows:
         assert isinstance(self.measurement.data, DropTest)
         return self.measurement.data
 
-    def scatter(self, values: dict[str, Any], residuals: np.ndarray) -> tuple[float, float]:
-        """Return the standard deviation of eps from impact to impact, and that of a fit.
-
-        The latter is larger: it is estimated from few impacts, and its own error widens the error
-        bar, as Student's t does.
+    def scatter(self, values: dict[str, Any], residuals: np.ndarray) -> float:
+        """Return the standard deviation of eps from impact to impact.
 
         Args:
             values: parameters of the gas, by name; "spread" is the scatter of eps. Without it the
@@ -263,24 +260,25 @@ class DropRows:
             residuals: measured minus computed values, over their errors.
         """
         if "spread" in values:
-            return float(values["spread"]), float(values["spread"])
+            return float(values["spread"])
         if not self.data.scatters:
-            return 0.0, 0.0
+            return 0.0
         errors = self._errors(values)
-        spread = most_likely_scatter(residuals[: errors.size], errors)
-        return spread, spread * few_values_factor(errors.size)
+        return most_likely_scatter(residuals[: errors.size], errors)
 
-    def widening(self, values: dict[str, Any], residuals: np.ndarray) -> np.ndarray:
-        """Return the factor by which eps that scatters from impact to impact widens each error.
+    def widening(self, values: dict[str, Any], scatter: float) -> np.ndarray:
+        """Return the factor by which the scatter of eps widens each error.
+
+        A scatter that is found from few impacts widens them more, see `few_values_factor`.
 
         Args:
-            values, residuals: see `scatter`.
+            values, scatter: see `scatter`.
         """
         factors = np.ones(self.data.num_values)
-        _, spread = self.scatter(values, residuals)
-        if spread > 0:
+        if scatter > 0:
             errors = self._errors(values)
-            factors[: errors.size] = np.hypot(1.0, spread / errors)
+            few = 1.0 if "spread" in values else few_values_factor(errors.size)
+            factors[: errors.size] = np.hypot(1.0, few * scatter / errors)
         return factors
 
     def _errors(self, values: dict[str, Any]) -> np.ndarray:

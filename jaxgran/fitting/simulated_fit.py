@@ -144,7 +144,7 @@ def _guess_of_theory(request: Request, gas: Gas) -> Gas:
 class Expansion(NamedTuple):
     """Measured values beside the mean of the simulations near an estimate.
 
-    All values are those of ln T at all times, followed by ln T_rot.
+    Values are ln T at all times, followed by ln T_rot.
 
     Attributes:
         computed: values of the mean simulation at the estimate, shape (values,).

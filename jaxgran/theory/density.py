@@ -44,7 +44,7 @@ def correlation_slowdown(
     """Return the share by which velocity correlations, once built up, reduce the cooling rate.
 
     Spheres that have collided move more nearly in parallel than before, and some of them collide
-    again: their normal speed is then lower than that of uncorrelated spheres. In modes of the flow:
+    again: their normal speed is then lower than without correlations. In modes of the flow:
     viscosity, and not impacts, cools a shear wave of wavenumber k > k_c. The wave holds
     ``1/((k/k_c)^2 - 1)`` of T above equipartition (`jaxgran.models.error_model`), and this energy
     takes no part in impacts. All waves shorter than L_c/2 reduce the rate by the share
@@ -57,7 +57,7 @@ def correlation_slowdown(
     collision rate is Enskog's, which the virial series exceeds by .4 % at phi = .3.
 
     Reference: Kawahara & Nakanishi, J. Phys. Soc. Jpn. 73 (2004) 68. In three-dimensional hard
-    spheres they measured an energy decay slower than that of independent collisions from the early
+    spheres they measured a slower energy decay than independent collisions give from the early
     stage on, and explained it by velocity correlations.
 
     Args:

@@ -155,7 +155,7 @@ def rough_impact_rates(
     The cooling is that by roughness. With the cumulants a_20 = a_2, a_11, a_02 and a_12 = 3 a_11
     a_02 the distribution of a sphere is ``(1 + a_20 T^2/2 d_TT + a_11 T a d_Ta + a_02 a^2/2 d_aa +
     a_12 T a^2/2 d_Taa) f`` with the Gaussian f of the variances T and a of the components of v and
-    s = (sigma/2) w, so that means are those of `rough_impact_means` and their derivatives, here by
+    s = (sigma/2) w, so that means are `rough_impact_means` and their derivatives, here by
     differences. Products of cumulants of two spheres are left out, and directions of v and s are
     taken to be independent.
 
@@ -265,7 +265,7 @@ MAX_SPEED_FACTOR = 1.2
 def element_bounds(scene: ReducedScene, dimension: int) -> ElementBounds:
     """Return upper bounds of the cooling and the heating by the elements of a scene.
 
-    The bound of the cooling is that of spheres that do not rotate and that stop at walls. The
+    Spheres that do not rotate, and that stop at walls, cool fastest. The
     rotation heats at most by the initial energy of the spins.
 
     Returns:

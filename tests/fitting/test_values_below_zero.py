@@ -8,7 +8,7 @@ import pytest
 import jaxgran
 from jaxgran.fitting.likelihood import log_density_change, log_ratio
 from tests.beads import glass_beads
-from tests.fitting.curves import fitted
+from tests.fitting.curves import fitted, rough_beads
 
 A = "dissipative_constant"
 GAS = glass_beads(0.15)
@@ -49,6 +49,20 @@ def test_values_below_zero_are_fitted():
     assert abs(slope * error) < 0.1  # both are the same likelihood
     with pytest.raises(ValueError, match="T below 0 .*kinetic theory"):
         fitted(GAS, curve, model=jaxgran.DSMC(50, replicas=2))
+
+
+def test_spins_below_zero_are_not_fitted_through_particles():
+    gas = rough_beads()
+    times = np.array([1.0, 2.0, 3.0, 4.0]) * float(gas.mean_free_time)
+    T = np.full(4, float(gas.temperature))
+    curve = jaxgran.CoolingCurve(
+        times,
+        T,
+        rotational_temperature=np.array([1.0, 1.0, 1.0, -0.1]) * T,
+        rotational_temperature_error=0.2 * T,
+    )
+    with pytest.raises(ValueError, match="T_rot of 0 or less .*kinetic theory"):
+        fitted(gas, curve, model=jaxgran.DSMC(50, replicas=2))
 
 
 def test_the_density_of_a_value_is_normalised():

@@ -13,6 +13,8 @@ from jaxgran.fitting.likelihood import Nodes, filtered
 from jaxgran.fitting.rows import Noise
 from jaxgran.scene.gas import reduced_scene
 from jaxgran.theory import sizes
+from jaxgran.theory.density import Density
+from jaxgran.theory.equations import Equations
 from tests.beads import glass_beads, hard_gas, without
 
 THEORY = jaxgran.KineticTheory(corrections=without("softness", "correlations"))
@@ -25,6 +27,24 @@ def of_sizes(gas, spread):
 def taus(gas, *values):
     """Times in mean free times."""
     return np.array(values) * float(gas.mean_free_time)
+
+
+def test_corrections_of_impacts_leave_the_drag_as_it_is():
+    gas = of_sizes(glass_beads(0.3, packing_fraction=0.2), 0.15)
+    dragged = replace(gas, drag=jaxgran.StokesDrag(0.1 / gas.mean_free_time))
+    equations = Equations(3, 2, maxwellian=False, spreading=False, sizes=True)
+    rates = []
+    for density in (Density(), Density.from_gas(gas)):
+        for scene in (reduced_scene(gas), reduced_scene(dragged)):
+            both = scene, density
+            state = equations.initial(both, jnp.zeros(1))
+            state = state.at[equations.names.index("collisions")].set(20.0)
+            state = state.at[equations.names.index("size_ratio")].set(0.3)
+            at_state = equations.table(both, jnp.asarray(1.0))(state[0])
+            rates.append(float(equations.derivative(state, at_state, both)[0]))
+    of_drag = rates[1] - rates[0]
+    assert abs(rates[2] / rates[0] - 1) > 0.01  # impacts are corrected
+    assert rates[3] - rates[2] == pytest.approx(of_drag, rel=1e-10)
 
 
 # --- impacts ------------------------------------------------------------------------------------
