@@ -3,8 +3,8 @@
 - `fit`: the public function `fit`, the checks of its arguments and warnings.
 - `setup`: what a user asks for, as a `problem` with a first guess: `rows` are the measured values,
   `parameters` the unknowns on an unconstrained scale.
-- `prediction`, `comparison`, `likelihood`: a curve by a model with its derivatives, its residuals,
-  and -2 ln L.
+- `prediction`, `comparison`, `innovations`: a curve by a model with its derivatives, and its
+  independent residuals; `likelihood`: the public function of the gas.
 - `search`: the maximum of the likelihood; `simulations`: the same for stochastic models, and
   `simulated_fit` its result.
 - `estimate`, `result`: the estimate with its errors by cause (`information`), and `Fit`.

@@ -1,6 +1,6 @@
 """A measured curve compared with its prediction: independent residuals and their derivatives.
 
-The innovations of a curve (`jaxgran.fitting.likelihood`) depend on the unknowns through the
+The innovations of a curve (`jaxgran.fitting.innovations`) depend on the unknowns through the
 predicted curve and through the scatter of N grains. They are differentiated by central differences
 along the tangents of the prediction: one call for all unknowns, by a program of its own.
 """
@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxgran._utils.tracing import fast_jit
-from jaxgran.fitting.likelihood import Innovations, Nodes, filtered, innovations
+from jaxgran.fitting.innovations import Innovations, Nodes, filtered, innovations
 from jaxgran.fitting.parameters import with_parameters
 from jaxgran.fitting.prediction import Element, PredictedCurve, Prediction
 from jaxgran.fitting.rows import DISPLACEMENT, Displacement, Noise, Observed

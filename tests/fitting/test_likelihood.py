@@ -9,7 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran.fitting.comparison import Comparison
-from jaxgran.fitting.likelihood import SAMPLE_MEMORY, Nodes, filtered
+from jaxgran.fitting.innovations import SAMPLE_MEMORY, Nodes, filtered
 from jaxgran.fitting.prediction import predicted_curve
 from jaxgran.fitting.rows import Noise, curve_rows
 from jaxgran.fitting.search import minimise

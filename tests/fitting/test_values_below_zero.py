@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.fitting.likelihood import log_density_change, log_ratio
+from jaxgran.fitting.innovations import log_density_change, log_ratio
 from tests.beads import glass_beads
 from tests.fitting.curves import fitted, rough_beads
 

@@ -9,7 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran._utils.tracing import fast_jit
-from jaxgran.fitting.likelihood import Nodes, filtered
+from jaxgran.fitting.innovations import Nodes, filtered
 from jaxgran.fitting.rows import Noise
 from jaxgran.scene.gas import reduced_scene
 from jaxgran.theory import sizes
