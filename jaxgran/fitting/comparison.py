@@ -193,10 +193,10 @@ class Comparison:
     def _noise(self, log_scatter: Any) -> Noise:
         curve = self.curve
         few_particles = self.sources.get("few particles", 1.0)
-        scatter = few_particles * curve.rows.scatter * np.exp(log_scatter)
+        of_number = few_particles * np.exp(log_scatter)
         white = float(curve.values.get(WHITE, 0.0))
         factor = self.sources.get("model", 1.0) ** 0.5
-        return curve.rows.noise(curve.times, scatter, white, factor)
+        return curve.rows.noise(curve.times, of_number, white, factor)
 
 
 def _nodes(curve: PredictedCurve, batch: Prediction, gas: Gas) -> Nodes:

@@ -145,7 +145,7 @@ def innovations(
         log_computed: ln T and ln T_rot with which the measured values are compared.
         sensitivity: derivative of the computed ln T in ln T of the gas: 1 without a noise floor.
         observed: the measured values.
-        noise: what makes them scatter; its `scatter` has the shape (gases,).
+        noise: what makes them scatter; its `inverse_number` has the shape (gases,).
     """
     values = observed.values[..., None]
     errors = observed.errors[..., None]
@@ -201,7 +201,7 @@ def _run_filter(
     rate_error, sample = size - 2, size - 1
     first = jnp.zeros((size, size, lanes), dtype)
     first = first.at[: size - 2, : size - 2].set(start)
-    first = first.at[0, 0].add(noise.scatter * noise.first)
+    first = first.at[0, 0].add(noise.inverse_number * noise.first)
     first = first.at[rate_error, rate_error].set(1.0)
     first = first.at[sample, sample].set(noise.sample)
     mean = jnp.zeros((size, *residuals.shape[2:]), dtype)
@@ -273,7 +273,7 @@ def _steps(
     rate_error = len(jacobian)
     size = rate_error + 1
     drift = jnp.zeros((size, size, *nodes.rotation.shape), jacobian.dtype)
-    noises = drift.at[:rate_error, :rate_error].set(noise.scatter * spread * collisions)
+    noises = drift.at[:rate_error, :rate_error].set(noise.inverse_number * spread * collisions)
     drift = drift.at[:rate_error, :rate_error].set(jacobian * collisions)
     # An error of the rate moves all temperatures along their mean course.
     error = _middle(noise.rate_error)[:, None]
@@ -305,7 +305,7 @@ def _steps(
     increments = increments.at[:, size, size].set(sampled)
     turning = nodes.rotation > 0
     of_rotation = (nodes.rotation + ROTATION_OFFSET) / jnp.where(turning, nodes.rotation, jnp.inf)
-    return noise.scatter * starts[:, :, 0], changes, increments, of_rotation
+    return noise.inverse_number * starts[:, :, 0], changes, increments, of_rotation
 
 
 def _middle(x: Array) -> Array:

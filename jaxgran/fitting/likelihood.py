@@ -167,22 +167,22 @@ def _of_temperatures(gas: Gas, nodes: Nodes, data: _Data) -> Float[Array, ""]:
     shapes = [jnp.broadcast_to(jnp.asarray(x), residuals.shape) for x in factors.values()]
     widths = jnp.asarray([rows.nuisances[name] for name in factors])
     is_known = rows.measurement.num_particles is not None
-    log_scatters = STEPS_OF_KNOWN_N if is_known else STEPS_OF_UNKNOWN_N
-    scatters = rows.scatter * jnp.exp(rows.scatter_error * log_scatters)
+    steps = STEPS_OF_KNOWN_N if is_known else STEPS_OF_UNKNOWN_N
+    factors_of_N = jnp.exp(rows.grains.log_error * steps)
 
     def for_each(x: Any) -> Any:
-        """Return an array with an axis of scatters, the last one."""
-        return None if x is None else jnp.broadcast_to(x[..., None], (*x.shape, scatters.size))
+        """Return an array with a last axis, of values of N."""
+        return None if x is None else jnp.broadcast_to(x[..., None], (*x.shape, steps.size))
 
     each = Nodes(*(for_each(x) for x in nodes))
     values, spread = filtered(
-        jax.tree.map(lambda x: jnp.broadcast_to(x, (scatters.size, *jnp.shape(x))), gas),
+        jax.tree.map(lambda x: jnp.broadcast_to(x, (steps.size, *jnp.shape(x))), gas),
         each._replace(times=nodes.times, sonine=nodes.sonine),
         for_each(jnp.stack([residuals, *shapes], axis=-1)),
         for_each(variances),
         for_each(jnp.ones_like(nodes.log_temperature)),
         observed.used,
-        jax.tree.map(jnp.asarray, rows.noise(data.times, scatters)),
+        jax.tree.map(jnp.asarray, rows.noise(data.times, factors_of_N)),
         differentiable=True,
     )
 
@@ -191,7 +191,7 @@ def _of_temperatures(gas: Gas, nodes: Nodes, data: _Data) -> Float[Array, ""]:
         return -0.5 * (square + jnp.sum(observed.used * jnp.log(spread)) + step**2)
 
     each_value = jax.vmap(of_scatter, in_axes=(-1, -1, 0))
-    value = jax.scipy.special.logsumexp(each_value(values, spread, jnp.asarray(log_scatters)))
+    value = jax.scipy.special.logsumexp(each_value(values, spread, jnp.asarray(steps)))
     change = log_density_change(observed.values, logs, observed.errors)
     return value - 0.5 * jnp.sum(observed.used * change)
 

@@ -288,7 +288,7 @@ def _compared_impacts(m: DropRows, values: dict[str, Any]) -> _ComparedImpacts:
     floats = {name: jnp.asarray(x) for name, x in values.items() if name in m.gas.domains}
     residuals, slopes = residuals_and_slopes(m.data.residuals, m.gas, floats)
     residuals = np.asarray(residuals)
-    scatter = m.scatter(floats, residuals)
+    scatter = m.scatter_of_eps(floats, residuals)
     return _ComparedImpacts(residuals, slopes, scatter, m.widening(floats, scatter))
 
 

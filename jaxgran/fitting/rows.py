@@ -81,18 +81,34 @@ class Observed(NamedTuple):
     simulation: Any
 
 
+class Grains(NamedTuple):
+    """What makes values of a finite number of grains scatter.
+
+    Attributes:
+        inverse_number: 1/N over all runs; where N is not known, a value about which it is searched.
+        log_error: standard error of the logarithm of the variance by N grains.
+        sample: variance of ln T where some of the grains are tracked.
+        first: variance of ln T at t = 0 over `inverse_number`: 0 where T_0 is the run's own.
+    """
+
+    inverse_number: float
+    log_error: float
+    sample: float = 0.0
+    first: float = 0.0
+
+
 class Noise(NamedTuple):
     """What makes the measured values scatter about theory, apart from their own errors.
 
     Attributes:
-        scatter: 1/N of all runs together, times a factor that a fit may vary.
-        first: variance of ln T at t = 0 over `scatter`: 0 where T_0 is the run's own.
+        inverse_number: 1/N over all runs, times a factor that a fit may vary.
+        first: variance of ln T at t = 0 over `inverse_number`: 0 where T_0 is the run's own.
         rate_error: relative standard error of theory's cooling rate at the nodes, shape (nodes,).
         sample: variance of ln T by the sampling of some of the grains.
         white: relative standard deviation of further errors, independent at each time.
     """
 
-    scatter: Any
+    inverse_number: Any
     first: Any
     rate_error: Any
     sample: Any
@@ -125,8 +141,7 @@ class CurveRows:
         values: measured T and T_rot, m^2/s^2, shape (times, 2).
         errors: their standard errors, with the rounding of the file; 0 where they have none.
         used: 1 where a value counts, 0 elsewhere.
-        scatter: 1/N over all runs; where N is not known, a value about which it is searched.
-        scatter_error: standard error of the logarithm of the scatter.
+        grains: what makes values of a finite number of grains scatter.
         faster: factor by which the measured gas cools faster because N is small.
         unit_time: mean free time of the scene, s.
         rate_error: times, s, and the relative error of the model's cooling rate at them.
@@ -135,8 +150,6 @@ class CurveRows:
         offset: ln T and ln T_rot of the fitted model minus those of the model that is evaluated,
             at the times of the data.
         simulation: variances of ln T and ln T_rot by simulations, shape (times, 2).
-        sample: variance of ln T where some of the grains are tracked.
-        first: variance of ln T at t = 0 over the scatter: 0 where T_0 is the run's own.
     """
 
     label: str
@@ -145,8 +158,7 @@ class CurveRows:
     values: Float[np.ndarray, "times 2"]
     errors: Float[np.ndarray, "times 2"]
     used: Float[np.ndarray, "times 2"]
-    scatter: float
-    scatter_error: float
+    grains: Grains
     faster: float
     unit_time: float
     rate_error: tuple[np.ndarray, np.ndarray]
@@ -154,8 +166,6 @@ class CurveRows:
     displacement: Displacement | None = None
     offset: np.ndarray | float = 0.0
     simulation: np.ndarray | float = 0.0
-    sample: float = 0.0
-    first: float = 0.0
 
     @property
     def scene(self) -> Gas:
@@ -199,26 +209,29 @@ class CurveRows:
         )
 
     def noise(
-        self, times: np.ndarray, scatter: Any, white: float = 0.0, model: float = 1.0
+        self, times: np.ndarray, factor: Any = 1.0, white: float = 0.0, model: float = 1.0
     ) -> Noise:
         """Return what makes the values scatter.
 
         Args:
             times: of the nodes, s.
-            scatter: 1/N of all runs, times a factor.
+            factor: of the variance by N grains.
             white: see `Noise`.
             model: factor of the error of the cooling rate.
         """
         known, error = self.rate_error
-        rate_error = model * np.interp(times, known, error)
         return Noise(
-            scatter, np.asarray(self.first), rate_error, np.asarray(self.sample), np.asarray(white)
+            inverse_number=self.grains.inverse_number * factor,
+            first=np.asarray(self.grains.first),
+            rate_error=model * np.interp(times, known, error),
+            sample=np.asarray(self.grains.sample),
+            white=np.asarray(white),
         )
 
     @property
     def nuisances(self) -> dict[str, float]:
         """Its nuisance parameters, with their standard errors."""
-        errors = {SCATTER: self.scatter_error}
+        errors = {SCATTER: self.grains.log_error}
         if self.measurement.calibration_error:
             errors[CALIBRATION] = self.measurement.calibration_error
         if self.uses_rotation:
@@ -251,7 +264,7 @@ class DropRows:
         assert isinstance(self.measurement.data, DropTest)
         return self.measurement.data
 
-    def scatter(self, values: dict[str, Any], residuals: np.ndarray) -> float:
+    def scatter_of_eps(self, values: dict[str, Any], residuals: np.ndarray) -> float:
         """Return the standard deviation of eps from impact to impact.
 
         Args:
@@ -272,7 +285,8 @@ class DropRows:
         A scatter that is found from few impacts widens them more, see `few_values_factor`.
 
         Args:
-            values, scatter: see `scatter`.
+            values: see `scatter_of_eps`.
+            scatter: the standard deviation.
         """
         factors = np.ones(self.data.num_values)
         if scatter > 0:
@@ -342,56 +356,99 @@ def curve_rows(
             is not used then.
     """
     gas = measurement.gas
-    curve = measurement.curve
-    notes: list[str] = []
-    T = np.asarray(curve.temperature)
-    uses_rotation = gas.surface is not None and curve.rotational_temperature is not None
-    T_rot = np.asarray(curve.rotational_temperature) if uses_rotation else np.ones_like(T)
-    given = [curve.temperature_error, curve.rotational_temperature_error if uses_rotation else None]
-    components = [gas.dimension, NUM_SPIN_COMPONENTS[gas.dimension]]
-    errors = np.stack(
-        [
-            _errors_of_measurement(name, measurement, x, values, degrees, notes)
-            for name, x, values, degrees in zip(
-                ("T_err", "T_rot_err"), given, (T, T_rot), components, strict=True
-            )
-        ],
-        axis=1,
+    values = _values(measurement)
+    errors, notes = _errors(measurement, values)
+    accuracy = float(model.rotation_accuracy(gas)) if _has_rotation(measurement) else 0.0
+    rows = CurveRows(
+        label=label,
+        measurement=measurement,
+        gas=with_neutral_elements(gas, model),
+        values=values,
+        errors=errors,
+        used=_used(measurement, values, fits_T_0),
+        grains=_grains(measurement, fits_T_0),
+        faster=_finite_size_factor(measurement),
+        unit_time=float(scales_at(gas).mean_free_time),
+        rate_error=(np.zeros(1), np.zeros(1)),
+        rotation_accuracy=accuracy,
+        displacement=None if fits_t0 else _displacement(measurement, model),
     )
-    for k, name in enumerate(("temperature", "rotational_temperature")):
-        digit = np.asarray(measurement.rounding.get(name, 0.0))
-        errors[:, k] = np.hypot(errors[:, k], digit / 12**0.5)
-    used = np.stack([np.ones(T.size), np.full(T.size, float(uses_rotation))], axis=1)
+    return rows, notes
+
+
+def _has_rotation(measurement: Measurement) -> bool:
+    measured = measurement.curve.rotational_temperature
+    return measurement.gas.surface is not None and measured is not None
+
+
+def _values(measurement: Measurement) -> Float[np.ndarray, "times 2"]:
+    """Return the measured T and T_rot, which is 1 where it is not compared."""
+    T = np.asarray(measurement.curve.temperature)
+    T_rot = np.ones_like(T)
+    if _has_rotation(measurement):
+        T_rot = np.asarray(measurement.curve.rotational_temperature)
+    return np.stack([T, T_rot], axis=1)
+
+
+def _errors(
+    measurement: Measurement, values: Float[np.ndarray, "times 2"]
+) -> tuple[Float[np.ndarray, "times 2"], list[str]]:
+    """Return the standard errors of T and T_rot with the rounding of the file, and notes."""
+    dimension = measurement.gas.dimension
+    notes: list[str] = []
+    given = measurement.curve.temperature_error
+    of_T = _errors_of_measurement("T_err", measurement, given, values[:, 0], dimension, notes)
+    given = measurement.curve.rotational_temperature_error if _has_rotation(measurement) else None
+    spins = NUM_SPIN_COMPONENTS[dimension]
+    of_rotation = _errors_of_measurement(
+        "T_rot_err", measurement, given, values[:, 1], spins, notes
+    )
+    digits = measurement.rounding
+    of_T = np.hypot(of_T, np.asarray(digits.get("temperature", 0.0)) / 12**0.5)
+    digit = np.asarray(digits.get("rotational_temperature", 0.0))
+    of_rotation = np.hypot(of_rotation, digit / 12**0.5)
+    return np.stack([of_T, of_rotation], axis=1), notes
+
+
+def _used(
+    measurement: Measurement, values: Float[np.ndarray, "times 2"], fits_T_0: bool
+) -> Float[np.ndarray, "times 2"]:
+    """Return 1 where a value counts, 0 elsewhere.
+
+    A value at t = 0 without an error is the T_0 of the run.
+    """
+    curve = measurement.curve
+    used = np.ones_like(values)
+    used[:, 1] = float(_has_rotation(measurement))
     if np.asarray(curve.times)[0] == 0 and not _has_error_at_first(measurement):
         used[0, 0] = float(fits_T_0)
         used[0, 1] = 0.0
-    given_error = np.asarray(0.0 if given[1] is None else given[1])
-    used[:, 1] *= (T_rot > 0) | (given_error > 0)
+    error = curve.rotational_temperature_error
+    used[:, 1] *= (values[:, 1] > 0) | (np.asarray(0.0 if error is None else error) > 0)
+    return used
+
+
+def _grains(measurement: Measurement, fits_T_0: bool) -> Grains:
     N = measurement.num_particles
-    total = (UNKNOWN_NUMBER if N is None else N) * measurement.replicas
+    runs = measurement.replicas
+    dimension = measurement.gas.dimension
     tracked = measurement.tracked
     sample = 0.0
     if tracked is not None:
         left = 1 - (0 if N is None else tracked / N)
-        sample = 2 / (gas.dimension * tracked * measurement.replicas) * left
-    rows = CurveRows(
-        label,
-        measurement,
-        with_neutral_elements(gas, model),
-        np.stack([T, T_rot], axis=1),
-        errors,
-        used,
-        scatter=1 / total,
-        scatter_error=WEAK_SCATTER if N is None else SCATTER_ERROR,
-        faster=1.0 if N is None else float(finite_size_cooling_factor(gas, float_array(N))),
-        unit_time=float(scales_at(gas).mean_free_time),
-        rate_error=(np.zeros(1), np.zeros(1)),
-        rotation_accuracy=float(model.rotation_accuracy(gas)) if uses_rotation else 0.0,
-        displacement=None if fits_t0 else _displacement(measurement, model),
+        sample = 2 / (dimension * tracked * runs) * left
+    return Grains(
+        inverse_number=1 / ((UNKNOWN_NUMBER if N is None else N) * runs),
+        log_error=WEAK_SCATTER if N is None else SCATTER_ERROR,
         sample=sample,
-        first=2 / gas.dimension if measurement.ensemble_start and not fits_T_0 else 0.0,
+        first=2 / dimension if measurement.ensemble_start and not fits_T_0 else 0.0,
     )
-    return rows, notes
+
+
+def _finite_size_factor(measurement: Measurement) -> float:
+    """Return the factor by which the measured gas cools faster because N is small."""
+    N = measurement.num_particles
+    return 1.0 if N is None else float(finite_size_cooling_factor(measurement.gas, float_array(N)))
 
 
 def _has_error_at_first(measurement: Measurement) -> bool:

@@ -278,7 +278,7 @@ def by_descent(
     used = jnp.asarray(sims.rows.used.T.ravel())
     measured = sims.measured
     errors = (sims.rows.errors / np.where(sims.rows.used > 0, sims.rows.values, 1.0)).T.ravel()
-    scale = np.sqrt(errors**2 + 2 * sims.theory.scatter)
+    scale = np.sqrt(errors**2 + 2 * sims.theory.grains.inverse_number)
 
     def loss(flat: Array, stream: int) -> Array:
         curve = sims.curve_at(flat, stream)
