@@ -18,6 +18,7 @@ computed again. Impacts of the added drop test are drawn from the law, with thei
 """
 
 import dataclasses
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -26,10 +27,16 @@ import numpy as np
 import jaxgran
 from experiments.fit.drop_tower import NUM_PARTICLES as NUM_IN_TOWER
 from experiments.fit.drop_tower import scene as drop_tower
-from experiments.fit.wrong_physics import NUM_PARTICLES, NUM_POINTS, THEORY, WALLS, beads
-from experiments.support.analysis import fit_quietly
+from experiments.fit.wrong_physics import (
+    NUM_PARTICLES,
+    NUM_POINTS,
+    THEORY,
+    WALLS,
+    beads,
+)
+from experiments.support.analysis import fit_quietly, replicas_of
 from experiments.support.plots import GUIDE, INK, caption, panels
-from experiments.support.record import Options, collected, figures, run_parts
+from experiments.support.record import Options, collected, each_alone, figures, run_parts
 from experiments.support.scenes import cool
 from jaxgran.fitting.candidates import Planned, standard_candidates
 from jaxgran.fitting.plan import OPEN_WIDTH
@@ -80,8 +87,9 @@ def planned(scene: Scene) -> jaxgran.Measurement:
     )
 
 
-def compared(scene: Scene, runs: int) -> dict:
-    """Return the widths that a plan expects, and those of runs."""
+def compared(number: int, runs: int) -> dict:
+    """Return the widths that a plan of a scene expects, and those of runs."""
+    scene = SCENES[number]
     measurement = planned(scene)
     plan = jaxgran.plan(measurement)
     changes = {c.name: c.change for c in standard_candidates(plan.measurement)}
@@ -89,8 +97,8 @@ def compared(scene: Scene, runs: int) -> dict:
     for expected in (plan.present, *plan.additions[:NUM_ADDITIONS]):
         change = changes.get(expected.name)
         experiment = plan.measurement if change is None else change(plan.measurement)
-        found = [fitted(experiment, seed) for seed in range(runs)]
-        low, high = np.array(found).T
+        assert experiment is not None
+        low, high = np.array([fitted(x) for x in simulated(experiment, runs)]).T
         widths = np.minimum(high - low, OPEN_WIDTH)
         quartiles = np.percentile(widths, [25, 50, 75])
         rows.append(
@@ -106,44 +114,58 @@ def compared(scene: Scene, runs: int) -> dict:
     return {"name": scene.name, "runs": runs, "rows": rows}
 
 
-def fitted(experiment: Planned | None, seed: int) -> tuple[float, float]:
-    """Simulate an experiment, and return the range of A over the true value."""
-    experiment = {"": experiment} if isinstance(experiment, jaxgran.Measurement) else experiment
-    assert experiment is not None
-    rng = np.random.default_rng(seed)
-    simulated = {name: one(m, rng, seed) for name, m in experiment.items()}
-    true_A = next(iter(experiment.values())).gas.value("dissipative_constant")
-    given = simulated[""] if [*simulated] == [""] else simulated
-    result = fit_quietly(given, free=("dissipative_constant",))
+def fitted(experiment: Planned) -> tuple[float, float]:
+    """Return the range of A of a measured experiment, over the true value."""
+    several = {"": experiment} if isinstance(experiment, jaxgran.Measurement) else experiment
+    true_A = float(next(iter(several.values())).gas.value("dissipative_constant"))
+    result = fit_quietly(experiment, free=("dissipative_constant",))
     ends = result.ranges.get("dissipative_constant", (0.0, np.inf))
-    low, high = (float(np.squeeze(x)) / float(true_A) for x in ends)
+    low, high = (float(np.squeeze(x)) / true_A for x in ends)
     return low, high
 
 
-def one(m: jaxgran.Measurement, rng: np.random.Generator, seed: int) -> jaxgran.Measurement:
-    """Return a simulated measurement, with its noise."""
+def simulated(experiment: Planned, runs: int) -> Iterator[Planned]:
+    """Yield an experiment as it is measured in each run."""
+    if isinstance(experiment, jaxgran.Measurement):
+        yield from runs_of(experiment, runs)
+        return
+    each = {label: runs_of(m, runs) for label, m in experiment.items()}
+    for run in range(runs):
+        yield {label: found[run] for label, found in each.items()}
+
+
+def runs_of(m: jaxgran.Measurement, runs: int) -> list[jaxgran.Measurement]:
+    """Return a measurement of each run, simulated with its noise."""
+    rng = np.random.default_rng(0)
     if isinstance(m.data, jaxgran.DropTest):
         error = np.asarray(m.data.error)
-        eps = np.asarray(m.data.computed(m.gas)) + error * rng.standard_normal(error.size)
-        return dataclasses.replace(m, data=dataclasses.replace(m.data, restitution=eps))
-    run = cool(m.gas, m.curve.times, jaxgran.HardSpheres(m.num_particles), seed)
+        exact = np.asarray(m.data.computed(m.gas))
+        each = exact + error * rng.standard_normal((runs, error.size))
+        drops = [dataclasses.replace(m.data, restitution=eps) for eps in each]
+        return [dataclasses.replace(m, data=data) for data in drops]
+    curve = cool(m.gas, m.curve.times, jaxgran.HardSpheres(m.num_particles, replicas=runs))
     fields = {}
     for name in ("temperature", "rotational_temperature"):
         error = getattr(m.curve, f"{name}_error")
         if error is None:
             continue
         relative = np.asarray(error / getattr(m.curve, name))
-        noisy = getattr(run, name) * (1 + relative * rng.standard_normal(relative.size))
+        exact = replicas_of(curve, name)
+        noisy = exact * (1 + relative * rng.standard_normal(exact.shape))
         fields |= {name: noisy, f"{name}_error": relative * noisy}
-    return dataclasses.replace(m, data=jaxgran.CoolingCurve(m.curve.times, **fields))
+    curves = [
+        jaxgran.CoolingCurve(m.curve.times, **{name: x[run] for name, x in fields.items()})
+        for run in range(runs)
+    ]
+    return [dataclasses.replace(m, data=data) for data in curves]
 
 
 def plan(options: Options) -> dict:
-    """Compare the scenes."""
+    """Compare the scenes, each in a process of its own."""
     known = figures("plan", {"scenes": []})["scenes"] if options.rows else []
     scenes = {found["name"]: found for found in known}
-    asked = [scene for scene in SCENES if options.rows in scene.name]
-    for found in collected(compared(scene, options.runs) for scene in asked):
+    asked = [k for k, scene in enumerate(SCENES) if options.rows in scene.name]
+    for found in collected(each_alone(compared, [(k, options.runs) for k in asked])):
         scenes[found["name"]] = found
     found = [scenes[scene.name] for scene in SCENES if scene.name in scenes]
     ratios = [row["achieved"] / row["expected"] for scene in found for row in scene["rows"]]
