@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -131,47 +132,19 @@ def minimise(
         max_steps: maximum number of steps.
         tolerance: length of a Newton step, in standard errors, at which the search ends.
     """
-
-    farthest = _farthest(problem)
-
-    def value(flat: np.ndarray) -> float:
-        if np.any(np.abs(flat - first) > farthest):
-            return np.inf
-        found = problem.evaluate(flat)
-        return found.value if found.is_finite else np.inf
-
-    def length_of_step(flat: np.ndarray) -> float:
-        return newton_step(problem.evaluate(flat))[1]
-
-    lowest = np.inf
-    stalled = 0
-
-    def stop_at_minimum(flat: np.ndarray) -> None:
-        nonlocal lowest, stalled
-        stalled = stalled + 1 if value(flat) > lowest - MIN_FALL_OF_STEP else 0
-        lowest = value(flat)
-        if length_of_step(flat) < tolerance or stalled >= MAX_STALLED:
-            raise StopIteration
-
-    if not np.isfinite(value(first)):
+    objective = _Objective(problem, first)
+    if not np.isfinite(objective.value(first)):
         return Minimum(first, np.inf, 0, False)
-    if length_of_step(first) < tolerance:
-        return Minimum(first, value(first), 0, True)
-
-    def gradient(flat: np.ndarray) -> np.ndarray:
-        return np.nan_to_num(problem.evaluate(flat).gradient)
-
-    def hessian(flat: np.ndarray) -> np.ndarray:
-        found = problem.evaluate(flat)
-        return 2 * found.information if found.is_finite else np.eye(flat.size)
-
+    if objective.newton_length(first) < tolerance:
+        return Minimum(first, objective.value(first), 0, True)
+    ending = _Ending(objective, tolerance)
     solution = scipy.optimize.minimize(
-        value,
+        objective.value,
         first,
-        jac=gradient,
-        hess=hessian,
+        jac=objective.gradient,
+        hess=objective.hessian,
         method="trust-exact",
-        callback=stop_at_minimum,
+        callback=ending,
         options={
             "gtol": 0.0,
             "maxiter": max_steps,
@@ -180,16 +153,75 @@ def minimise(
         },
     )
     end = np.asarray(solution.x)
-    limit = max(tolerance, STALLED_STEP if stalled >= MAX_STALLED else CONVERGED_STEP)
+    limit = max(tolerance, STALLED_STEP if ending.has_stalled else CONVERGED_STEP)
     step, length = newton_step(problem.evaluate(end))
     if length < CONVERGED_STEP:
         end = end + step
-    return Minimum(end, value(end), int(solution.nit), length < limit)
+    return Minimum(end, objective.value(end), int(solution.nit), length < limit)
 
 
-def _farthest(problem: Problem) -> Float[np.ndarray, "unknowns"]:
-    limits = [MAX_DISTANCE.get(u.name, MAX_DISTANCE_OF_OTHERS) for u in problem.unknowns]
-    return np.repeat(limits, [u.size for u in problem.unknowns])
+@dataclass(frozen=True)
+class _Objective:
+    """-2 ln L in the neighbourhood of a first guess."""
+
+    problem: Problem
+    first: Float[np.ndarray, "unknowns"]
+
+    @cached_property
+    def _farthest(self) -> Float[np.ndarray, "unknowns"]:
+        unknowns = self.problem.unknowns
+        limits = [MAX_DISTANCE.get(u.name, MAX_DISTANCE_OF_OTHERS) for u in unknowns]
+        return np.repeat(limits, [u.size for u in unknowns])
+
+    def value(self, flat: np.ndarray) -> float:
+        """Return -2 ln L; inf far from the first guess, and where it cannot be computed."""
+        if np.any(np.abs(flat - self.first) > self._farthest):
+            return np.inf
+        found = self.problem.evaluate(flat)
+        return found.value if found.is_finite else np.inf
+
+    def gradient(self, flat: np.ndarray) -> np.ndarray:
+        """Return its first derivatives."""
+        return np.nan_to_num(self.problem.evaluate(flat).gradient)
+
+    def hessian(self, flat: np.ndarray) -> np.ndarray:
+        """Return its expected second derivatives."""
+        found = self.problem.evaluate(flat)
+        return 2 * found.information if found.is_finite else np.eye(flat.size)
+
+    def newton_length(self, flat: np.ndarray) -> float:
+        """Return the length of the next Newton step, in standard errors."""
+        return newton_step(self.problem.evaluate(flat))[1]
+
+
+@dataclass
+class _Ending:
+    """Ends a search after a step, where the next one is short or -2 ln L no longer falls.
+
+    Attributes:
+        objective: of the search.
+        tolerance: length of a short step, in standard errors.
+        lowest: -2 ln L after the last step.
+        num_stalled: number of steps in succession that hardly lowered it.
+    """
+
+    objective: _Objective
+    tolerance: float
+    lowest: float = np.inf
+    num_stalled: int = 0
+
+    @property
+    def has_stalled(self) -> bool:
+        """Whether -2 ln L no longer falls."""
+        return self.num_stalled >= MAX_STALLED
+
+    def __call__(self, flat: np.ndarray) -> None:
+        value = self.objective.value(flat)
+        has_fallen = value <= self.lowest - MIN_FALL_OF_STEP
+        self.num_stalled = 0 if has_fallen else self.num_stalled + 1
+        self.lowest = value
+        if self.objective.newton_length(flat) < self.tolerance or self.has_stalled:
+            raise StopIteration
 
 
 def best_of_starts(
@@ -215,6 +247,20 @@ def is_transformation(solver: Any) -> bool:
     return all(callable(getattr(solver, name, None)) for name in ("init", "update"))
 
 
+class Loss(NamedTuple):
+    """What a gradient descent lowers, at one step.
+
+    Attributes:
+        value: -2 ln L.
+        gradient: its derivatives.
+        at_minimum: whether the next Newton step is short.
+    """
+
+    value: Any
+    gradient: Any
+    at_minimum: bool = False
+
+
 @dataclass(frozen=True)
 class Descent:
     """A gradient descent.
@@ -231,16 +277,13 @@ class Descent:
 
     def __call__(self, problem: Problem, first: np.ndarray, max_steps: int) -> Minimum:
         """Minimise -2 ln L of a model without noise: a search as `minimise`."""
+        objective = _Objective(problem, first)
 
-        farthest = _farthest(problem)
-
-        def loss(flat: np.ndarray, step: int) -> tuple[float, np.ndarray, bool]:
-            if np.any(np.abs(flat - first) > farthest):
-                return np.inf, np.zeros_like(flat), False
+        def loss(flat: np.ndarray, step: int) -> Loss:
+            if not np.isfinite(objective.value(flat)):
+                return Loss(np.inf, np.zeros_like(flat))
             found = problem.evaluate(flat)
-            if not found.is_finite:
-                return np.inf, found.gradient, False
-            return found.value, found.gradient, newton_step(found)[1] < LAST_STEP
+            return Loss(found.value, found.gradient, newton_step(found)[1] < LAST_STEP)
 
         size = sum(row.values.size for row in problem.evaluate(first).rows)
         course = self.descend(loss, first, max_steps, size, problem.estimates, noisy=False)
@@ -255,7 +298,7 @@ class Descent:
 
     def descend(
         self,
-        loss_and_gradient: Callable[[np.ndarray, int], tuple[Any, Any, bool]],
+        loss_at: Callable[[np.ndarray, int], Loss],
         first: np.ndarray,
         max_steps: int,
         size: int,
@@ -265,62 +308,93 @@ class Descent:
     ) -> Course:
         """Descend until the loss ceases to fall.
 
-        `loss_and_gradient` also returns True at a minimum; `size` is the number of residuals.
+        Args:
+            loss_at: the loss at some unknowns, at a step.
+            first: the first guess.
+            max_steps: maximum number of steps.
+            size: number of residuals.
+            estimates: SI values of the free parameters at some unknowns.
+            noisy: whether the loss has noise.
         """
-        import optax  # the user has imported it to make the solver
-
-        transform: Any = optax.with_extra_args_support(self.solver)
-        update = eqx.filter_jit(
-            lambda gradient, state, flat, loss: transform.update(
-                gradient, state, flat, value=loss, grad=gradient
-            )
-        )
+        update = self._compiled_update()
         flat = jnp.asarray(first)
-        state = transform.init(flat)
+        state = self._transformation.init(flat)
         losses: list[float] = []
         flats = []
         converged = False
-        growth = ""
+        divergence = ""
         reason = f"the largest number of steps, {max_steps}, was reached"
         hidden = None if self.progress else True  # None hides the bar where there is no terminal
         with tqdm(total=max_steps, disable=hidden, desc="fit", unit="step") as bar:
             for step in range(max_steps):
-                loss, gradient, at_minimum = loss_and_gradient(np.asarray(flat), step)
-                losses.append(float(loss))
+                loss = loss_at(np.asarray(flat), step)
+                losses.append(float(loss.value))
                 flats.append(np.asarray(flat))
                 bar.update()
                 bar.set_postfix_str(f"-2 ln L {losses[-1]:.4g}")
-                if not (np.isfinite(losses[-1]) and np.all(np.isfinite(gradient))):
-                    growth = ", not finite"
-                elif losses[-1] > losses[0] + MAX_GROWTH * size and losses[-1] > 2 * losses[0]:
-                    growth = f", {losses[0]:.3g} at first"
-                if growth:
-                    reason = (
-                        f"the descent diverges: -2 ln L is {losses[-1]:.3g} at step {step}{growth}."
-                        " Lower the learning rate, or limit the gradient, as in optax.chain("
-                        "optax.clip_by_global_norm(1.0), optax.sgd(0.1))"
-                    )
-                    break
-                converged = at_minimum or _has_ceased(losses, noisy)
+                divergence = _divergence(losses, loss.gradient, size)
+                converged = not divergence and (loss.at_minimum or _has_ceased(losses, noisy))
                 if converged:
-                    reason = f"the next Newton step is below {LAST_STEP:g} standard errors"
-                    if not at_minimum:
-                        steps = WINDOW if noisy else PATIENCE
-                        reason = f"-2 ln L no longer falls, in {steps} steps"
+                    reason = _reason_to_end(loss.at_minimum, noisy)
+                if divergence or converged:
                     break
-                try:
-                    changes, state = update(jnp.asarray(gradient), state, flat, jnp.asarray(loss))
-                except TypeError as error:
-                    raise ValueError(
-                        "this transformation of optax needs more than gradients, such as a line "
-                        "search. Use optax.adam(0.05)"
-                    ) from error
+                changes, state = update(
+                    jnp.asarray(loss.gradient), state, flat, jnp.asarray(loss.value)
+                )
                 flat = flat + changes
+        reason = divergence or reason
         trace = Trace(np.asarray(losses), np.stack([estimates(x) for x in flats]), reason)
-        if growth and self.throw:
+        if divergence and self.throw:
             raise RuntimeError(f"{reason}; throw=False returns the best step so far")
         numbers = np.where(np.isnan(losses), np.inf, losses)
-        return Course(np.stack(flats), numbers, converged, bool(growth), trace)
+        return Course(np.stack(flats), numbers, converged, bool(divergence), trace)
+
+    @cached_property
+    def _transformation(self) -> Any:
+        import optax  # the user has imported it to make the solver
+
+        return optax.with_extra_args_support(self.solver)
+
+    def _compiled_update(self) -> Callable[..., tuple[Any, Any]]:
+        """Return a function that gives the change of the unknowns and the new state."""
+        compiled = eqx.filter_jit(
+            lambda gradient, state, flat, loss: self._transformation.update(
+                gradient, state, flat, value=loss, grad=gradient
+            )
+        )
+
+        def update(*arguments: Any) -> tuple[Any, Any]:
+            try:
+                return compiled(*arguments)
+            except TypeError as error:
+                raise ValueError(
+                    "this transformation of optax needs more than gradients, such as a line "
+                    "search. Use optax.adam(0.05)"
+                ) from error
+
+        return update
+
+
+def _divergence(losses: list[float], gradient: Any, size: int) -> str:
+    """Return how a descent diverges; "" while it does not."""
+    last = losses[-1]
+    if not (np.isfinite(last) and np.all(np.isfinite(gradient))):
+        growth = ", not finite"
+    elif last > losses[0] + MAX_GROWTH * size and last > 2 * losses[0]:
+        growth = f", {losses[0]:.3g} at first"
+    else:
+        return ""
+    return (
+        f"the descent diverges: -2 ln L is {last:.3g} at step {len(losses) - 1}{growth}."
+        " Lower the learning rate, or limit the gradient, as in optax.chain("
+        "optax.clip_by_global_norm(1.0), optax.sgd(0.1))"
+    )
+
+
+def _reason_to_end(at_minimum: bool, noisy: bool) -> str:
+    if at_minimum:
+        return f"the next Newton step is below {LAST_STEP:g} standard errors"
+    return f"-2 ln L no longer falls, in {WINDOW if noisy else PATIENCE} steps"
 
 
 def _has_ceased(losses: list[float], noisy: bool) -> bool:

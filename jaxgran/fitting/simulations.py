@@ -28,7 +28,7 @@ from jaxgran.fitting.parameters import (
 from jaxgran.fitting.prediction import predicted_curve
 from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.rows import CurveRows
-from jaxgran.fitting.search import Descent, Trace
+from jaxgran.fitting.search import Descent, Loss, Trace
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.scene.gas import Gas
@@ -286,8 +286,8 @@ def by_descent(
         prior = sims.gas_at(flat).law.prior_residuals()
         return jnp.sum(residuals**2) + jnp.sum(prior**2)
 
-    def at(flat: np.ndarray, step: int) -> tuple[Any, Any, bool]:
-        return *jax.value_and_grad(loss)(jnp.asarray(flat), step), False
+    def at(flat: np.ndarray, step: int) -> Loss:
+        return Loss(*jax.value_and_grad(loss)(jnp.asarray(flat), step))
 
     size = int(np.sum(sims.rows.used))
     course = descent.descend(at, first, max_simulations, size, sims.problem.estimates, noisy=True)
