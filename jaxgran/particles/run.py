@@ -184,6 +184,17 @@ class Groups(NamedTuple):
         shared = max(len(self.devices), 1)
         return np.minimum(np.arange(-(-self.number // shared) * shared), self.number - 1)
 
+    def keys(self, key: PRNGKeyArray) -> Array:
+        """Return a key of each group: that of group k of several is ``fold_in(key, k)``."""
+        if self.number == 1:
+            return key[None]
+        return jax.vmap(partial(jax.random.fold_in, key))(self.rows)
+
+    def split(self, arrays: Any) -> Any:
+        """Return arrays of all replicas with a first axis of groups; None remains None."""
+        rows = self.rows
+        return jax.tree.map(lambda x: x.reshape(self.number, -1, x.shape[-1])[rows], arrays)
+
 
 def grouped(replicas: int, spheres: int) -> Groups:
     """Return the groups of replicas: one of all of them, or one of each on CPU devices.
@@ -202,6 +213,20 @@ def grouped(replicas: int, spheres: int) -> Groups:
     if len(devices) > 1:
         return Groups(replicas, devices)
     return Groups(replicas if spheres >= MIN_SPHERES_PER_RUN else 1)
+
+
+class _Reached(NamedTuple):
+    """How far a run on the host has come, which a checkpoint contains.
+
+    Attributes:
+        num_done: number of times that are recorded.
+        state: of all groups.
+        records: at all times; 0 at those that are not reached.
+    """
+
+    num_done: int
+    state: Any
+    records: Any
 
 
 def run_on_host(
@@ -227,17 +252,12 @@ def run_on_host(
     dynamics = recorder.dynamics
     if dynamics.calls_host:
         groups = Groups(groups.number)
-    rows = groups.rows
     loop = HostLoop(dynamics, groups, run.progress)
-    keys = key[None]
-    if groups.number > 1:
-        keys = jax.vmap(partial(jax.random.fold_in, key))(rows)
+    keys = groups.keys(key)
     path = None if run.checkpoint is None else Path(run.checkpoint)
     resumed = path is not None and path.exists()
     write = _writer(recorder, loop, run, resumed, seconds)  # an error comes before the run
-    fault = np.zeros(len(rows), np.int32)
-    if start is not None:
-        start = jax.tree.map(lambda x: x.reshape(groups.number, -1, x.shape[-1])[rows], start)
+    start = groups.split(start)
     described: dict[str, str] = {}
     if path is not None:
         described = checkpoint.describe_run(
@@ -250,59 +270,92 @@ def run_on_host(
             save=recorder.save,
         )
     if start is None and resumed:  # only its shape counts
-        replicas, num_particles, dimension = dynamics.shape
-        blank = jnp.zeros((len(rows), replicas * num_particles, dimension), times.dtype)
-        start = blank, blank
-    elif start is None:
-        start, fault = dynamics.random_start(keys, loop.each, loop.reach)
-    state = loop.each(_begin, (dynamics, directions), (start, keys, fault))
+        start = _blank_start(dynamics, groups, times.dtype)
+    state = _first_state(loop, start, keys, directions)
     observe = partial(over_groups(_observe, groups.devices), recorder)
 
     def empty(x: Array) -> np.ndarray:
         return np.zeros((len(times), *x.shape), x.dtype)
 
-    num_done = 0
-    records = jax.tree.map(empty, observe(state))
+    reached = _Reached(0, state, jax.tree.map(empty, observe(state)))
     if path is not None and resumed:
-        num_done, loaded, records = checkpoint.load(path, described, (0, state, records))
-        state = jax.tree.map(jnp.asarray, loaded)
-    last_save = time.monotonic()
+        num_done, loaded, records = checkpoint.load(path, described, tuple(reached))
+        reached = _Reached(num_done, jax.tree.map(jnp.asarray, loaded), records)
 
-    def save() -> None:
+    def save(reached: _Reached) -> None:
         if path is not None:
-            checkpoint.save(path, described, (num_done, state, records))
+            checkpoint.save(path, described, tuple(reached))
+
+    reached = _record_all(loop, observe, times, reached, save, write)
+    particles = loop.each(_to_lab_frame, dynamics, reached.state)
+    faults = np.asarray(reached.state.status)
+    return Result(
+        records=_without_groups(reached.records, groups),
+        particles=jax.tree.map(lambda x: _joined(np.asarray(x), 0, groups), particles),
+        status=jnp.asarray(np.bitwise_or.reduce(faults, axis=None)),
+    )
+
+
+def _blank_start(dynamics: AbstractDynamics, groups: Groups, dtype: Any) -> tuple[Array, Array]:
+    replicas, num_particles, dimension = dynamics.shape
+    blank = jnp.zeros((len(groups.rows), replicas * num_particles, dimension), dtype)
+    return blank, blank
+
+
+def _first_state(loop: "HostLoop", start: Any, keys: Array, directions: Any) -> Any:
+    """Return the state of all groups at t = 0, of a random start where none is given."""
+    fault = np.zeros(len(loop.groups.rows), np.int32)
+    if start is None:
+        start, fault = loop.dynamics.random_start(keys, loop.each, loop.reach)
+    return loop.each(_begin, (loop.dynamics, directions), (start, keys, fault))
+
+
+def _record_all(
+    loop: "HostLoop",
+    observe: Callable[[Any], Records],
+    times: Float[Array, "times"],
+    reached: _Reached,
+    save: Callable[[_Reached], None],
+    write: Callable[[int, Any], None],
+) -> _Reached:
+    """Move all groups through the times that are left.
+
+    Args:
+        loop: around compiled code.
+        observe: returns the records of a state.
+        times: of the records.
+        reached: where the run begins; its records are filled.
+        save: writes a checkpoint.
+        write: writes the particles at time number k.
+    """
+    num_done, state, records = reached
+    last_save = time.monotonic()
 
     def temperature() -> str:
         return f"T/T_0 = {float(np.mean(observe(state).values['temperature'])):.3g}"
 
-    with progress_bar(float(times[-1]), loop.time(state), run.progress) as bar:
+    with progress_bar(float(times[-1]), loop.time(state), loop.progress) as bar:
         try:
             while num_done < len(times):
                 busy = True
                 while busy:
                     # An interruption saves the state before the current call.
-                    state, busy = loop.call(dynamics, state, times[num_done])
+                    state, busy = loop.call(loop.dynamics, state, times[num_done])
                     bar.update(loop.time(state) - bar.n)
                     if not bar.disable:
                         bar.set_postfix_str(temperature(), refresh=False)
                     if time.monotonic() - last_save > CHECKPOINT_SECONDS:
-                        save()
+                        save(_Reached(num_done, state, records))
                         last_save = time.monotonic()
                 for values, x in zip(*map(jax.tree.leaves, (records, observe(state))), strict=True):
                     values[num_done] = x
                 write(num_done, state)
                 num_done += 1
-            save()
         except KeyboardInterrupt:
-            save()
+            save(_Reached(num_done, state, records))
             raise
-    particles = loop.each(_to_lab_frame, dynamics, state)
-    faults = np.asarray(state.status)
-    return Result(
-        records=_without_groups(records, groups),
-        particles=jax.tree.map(lambda x: _joined(np.asarray(x), 0, groups), particles),
-        status=jnp.asarray(np.bitwise_or.reduce(faults, axis=None)),
-    )
+    save(_Reached(num_done, state, records))
+    return _Reached(num_done, state, records)
 
 
 def _begin(shared: tuple[AbstractDynamics, Any], group: tuple[Any, Any, Any]) -> Any:
