@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt, UInt32
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt, UInt32
 
 from jaxgran.particles.elements import tangential_impulse
 from jaxgran.scene.gas import ReducedScene
@@ -162,6 +162,57 @@ def collide(
         spin: s_i + s_j; smooth spheres have no components.
         drag_factor: ratio of physical velocities to these.
     """
+    impacts = _draw_impacts(relative, bits, ceiling, share)
+    hit = impacts.hit
+    eps = scene.law.restitution(impacts.speed * drag_factor)
+    push = jnp.where(hit, (1 + eps) / 2 * impacts.speed, 0.0)
+    lost = (1 - eps**2) / 2 * jnp.where(hit, impacts.speed**2, 0.0)
+    outcome = Outcome(
+        kick=jnp.stack([-push * n for n in impacts.normal], axis=-1),
+        spin_change=spin,
+        num=jnp.sum(hit, dtype=relative.dtype),
+        missed=impacts.missed,
+        gains=-jnp.sum(lost)[None],
+    )
+    surface = scene.surface
+    if surface is None:
+        return outcome
+    normal = jnp.stack(impacts.normal, axis=-1)
+    across, kick, spin_change = tangential_impulse(
+        relative, spin, normal, hit, surface.eta, surface, push
+    )
+    gain = 2 * jnp.sum(kick * (across + kick))  # of translation alone
+    rotational_gain = 2 * surface.inertia * jnp.sum(spin_change * (spin + spin_change))
+    return outcome._replace(
+        kick=outcome.kick + kick,
+        spin_change=spin_change,
+        gains=jnp.stack([outcome.gains[0] + gain, rotational_gain]),
+    )
+
+
+class _Impacts(NamedTuple):
+    """Impacts that candidate pairs have, drawn at random.
+
+    Attributes:
+        hit: whether a pair collides.
+        speed: normal speed at the impact; the ceiling where there is none.
+        normal: components of the unit vector along which it is.
+        missed: number of collisions missed because of the ceiling.
+    """
+
+    hit: Bool[Array, "pairs"]
+    speed: Float[Array, "pairs"]
+    normal: list[Float[Array, "pairs"]]
+    missed: Float[Array, ""]
+
+
+def _draw_impacts(
+    relative: Float[Array, "pairs d"],
+    bits: UInt32[Array, "2 pairs"],
+    ceiling: Float[Array, ""],
+    share: Float[Array, ""],
+) -> _Impacts:
+    """Draw impacts at a rate proportional to |g|, with normals weighted by g.n: see `collide`."""
     d = relative.shape[-1]
     dtype = relative.dtype
     g = [relative[:, k] for k in range(d)]
@@ -176,33 +227,16 @@ def collide(
     hit = in_disk & (chance * 2.0**-22 * ceiling < speed * share)
     cosine = jnp.sqrt(jnp.where(in_disk, 1 - sine_square, 1.0))
     sideways = _perpendicular(axis)
-    normal_speed = jnp.where(hit, speed * cosine, ceiling)
-    eps = scene.law.restitution(normal_speed * drag_factor)
-    square = jnp.where(hit, normal_speed**2, 0.0)
-    push = jnp.where(hit, (1 + eps) / 2 * normal_speed, 0.0)
     normal = [
         cosine * axis[k] + sum(b * e[k] for b, e in zip(offset, sideways, strict=True))
         for k in range(d)
     ]
-    outcome = Outcome(
-        kick=jnp.stack([-push * n for n in normal], axis=-1),
-        spin_change=spin,
-        num=jnp.sum(hit, dtype=dtype),
-        missed=share * jnp.sum(jnp.where(in_disk, jnp.maximum(speed / ceiling - 1, 0.0), 0.0)),
-        gains=-jnp.sum((1 - eps**2) / 2 * square)[None],
-    )
-    if (surface := scene.surface) is None:
-        return outcome
-    normal = jnp.stack(normal, axis=-1)
-    across, kick, spin_change = tangential_impulse(
-        relative, spin, normal, hit, surface.eta, surface, push
-    )
-    gain = 2 * jnp.sum(kick * (across + kick))  # of translation alone
-    rotational_gain = 2 * surface.inertia * jnp.sum(spin_change * (spin + spin_change))
-    return outcome._replace(
-        kick=outcome.kick + kick,
-        spin_change=spin_change,
-        gains=jnp.stack([outcome.gains[0] + gain, rotational_gain]),
+    beyond = jnp.where(in_disk, jnp.maximum(speed / ceiling - 1, 0.0), 0.0)
+    return _Impacts(
+        hit=hit,
+        speed=jnp.where(hit, speed * cosine, ceiling),
+        normal=normal,
+        missed=share * jnp.sum(beyond),
     )
 
 
