@@ -11,7 +11,7 @@ import numpy as np
 import scipy  # which imports scipy.stats at its first use
 
 from jaxgran.data.drop_test import DropTest
-from jaxgran.fitting.alternatives import DECLARABLE, Explanations
+from jaxgran.fitting.alternatives import DECLARABLE, Alternative, Explanations
 from jaxgran.fitting.goodness import SIGNIFICANCE
 from jaxgran.fitting.result import CONDITIONAL, Fit
 from jaxgran.models.base import Limitation
@@ -56,6 +56,8 @@ MESSAGES = {
     "not consistent": "{Model} {be} not consistent with this curve: do not trust the estimates."
     "{preferred} {remedy}",
     "preferred": " The data prefer a model with {name}.",
+    "preferred value": " The data prefer a model with {name}, in which {symbol} = {estimate:.3g} "
+    "{unit}.",
     "not trusted": "{Model} cannot be trusted in this scene, though the curve fits. {remedy}",
     "determined": "{Model} {be} consistent with this curve, which determines {symbol}: {range}."
     "{edge}",
@@ -232,6 +234,9 @@ def _narrowing(result: Fit, explanations: Explanations) -> str:
         return ""
     effects = sorted({x.effect for x in wide})
     low, high = explanations.ranges(without=wide)
+    widest_low, widest_high = explanations.ranges()
+    if low[0] <= widest_low[0] and high[0] >= widest_high[0]:
+        return ""
     return say(
         "narrowing",
         effects=" and no ".join(effects),
@@ -260,7 +265,7 @@ def _verdict(result: Fit, is_misfit: bool, limitations: tuple[Limitation, ...]) 
     if not result.converged:
         return NOT_CONSISTENT, say("not converged")
     if is_misfit or preferred:
-        best = MESSAGES["preferred"].format(name=preferred[0].name) if preferred else ""
+        best = _preferred(result, preferred[0]) if preferred else ""
         return NOT_CONSISTENT, say("not consistent", preferred=best, **words)
     if any(limitation.decisive for limitation in limitations):
         return NOT_CONSISTENT, say("not trusted", **words)
@@ -279,6 +284,13 @@ def _verdict(result: Fit, is_misfit: bool, limitations: tuple[Limitation, ...]) 
             return DETERMINED, say("determined", range=span, **words)
         why = say("possible", name=possible[0], range=span) if possible else span
     return NOT_DETERMINED, say("not determined", why=why, **words)
+
+
+def _preferred(result: Fit, best: Alternative) -> str:
+    """Return a sentence on the best alternative, with a blank before it."""
+    kind = "preferred" if best.restitution is not None else "preferred value"
+    estimate = float(best.estimate[0])
+    return MESSAGES[kind].format(name=best.name, estimate=estimate, **_unit_of(result))
 
 
 def say_edge(limitations: tuple[Limitation, ...]) -> str:
