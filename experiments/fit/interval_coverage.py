@@ -10,8 +10,7 @@ one film of one experiment does. Kinetic theory is fitted to each run with A and
 given. DSMC chooses new partners for each collision, so that its runs are fitted by kinetic theory
 of molecular chaos (without "correlations"). The standard error of the mean of 600 runs (200 of soft
 spheres) is .04 (.07) of that of one run. Finds the bias of ln A, its scatter, the scatter that the
-error budget predicts without the model's clock, which is the same in all runs, and the coverage by
-the whole budget. Recorded rows of other gases are kept.
+error budget predicts by the collisions of N particles, and the coverage by the whole budget. Recorded rows of other gases are kept.
 
 coverage_in_clusters: each curve is one LAMMPS run of 1000 spheres (phi = .3, beta_T0 = .2,
 t_c/tau_c = .05, in a box of 1.4 L_c) from a separate initial state. It lasts 90 mean free times,
@@ -66,9 +65,9 @@ def coverage(name: str, num_particles: int, phi: float, runs: int) -> dict[str, 
     if name == "dsmc":
         theory = replace(theory, corrections=theory.all_corrections - {"correlations"})
     fits = [fitted(gas, times, T, theory, num_particles) for T in replicas_of(curve, "temperature")]
-    chance = [(fit["parts"]["measurement"], fit["parts"]["few particles"]) for fit in fits]
     found = statistics(fits)
-    found["expected_scatter"] = float(np.sqrt(np.mean(np.sum(np.square(chance), axis=1))))
+    chance = [fit["parts"]["few particles"] for fit in fits]
+    found["expected_scatter"] = float(np.sqrt(np.mean(np.square(chance))))
     return found | {"coverage": found.pop("held") / runs}
 
 
