@@ -10,7 +10,8 @@ one film of one experiment does. Kinetic theory is fitted to each run with A and
 given. DSMC chooses new partners for each collision, so that its runs are fitted by kinetic theory
 of molecular chaos (without "correlations"). The standard error of the mean of 600 runs (200 of soft
 spheres) is .04 (.07) of that of one run. Finds the bias of ln A, its scatter, the scatter that the
-error budget predicts by the collisions of N particles, and the coverage by the whole budget. Recorded rows of other gases are kept.
+error budget predicts by the collisions of N particles, and the coverage by the whole budget.
+Recorded rows of other gases are kept.
 
 coverage_in_clusters: each curve is one LAMMPS run of 1000 spheres (phi = .3, beta_T0 = .2,
 t_c/tau_c = .05, in a box of 1.4 L_c) from a separate initial state. It lasts 90 mean free times,
