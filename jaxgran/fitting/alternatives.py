@@ -22,10 +22,11 @@ from jaxtyping import Float
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.comparison import FLOOR, WHITE
 from jaxgran.fitting.goodness import SIGNIFICANCE, goodness
+from jaxgran.fitting.information import inverse
 from jaxgran.fitting.parameters import Unknown, as_floats, domain_of, with_parameters
 from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.rows import CurveRows
-from jaxgran.fitting.search import Minimum, minimise, newton_step
+from jaxgran.fitting.search import Minimum, farthest, minimise, newton_step
 from jaxgran.models.error_model import ROUGHNESS_ERROR, SLIDING_ERROR
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.laws import VARIANT_SPEED, VISCOELASTIC_EXPONENT
@@ -278,9 +279,11 @@ def compare_alternatives(
     if goodness(problem, found)["smooth_p_value"] < SIGNIFICANCE / 2:
         # Such a curve prefers whatever has less noise.
         significant = np.inf
-    profiles = {kind: [_profile(problem, kind, base) for base in bases] for kind in kinds}
+    profiles = {
+        kind: [_profile(problem, kind, base, base.flat) for base in bases] for kind in kinds
+    }
     first = _preferred_element(profiles, bases[0].value - significant)
-    pairs = {} if first is None else _pairs(problem, first, profiles[first], absent)
+    pairs = {} if first is None else _pairs(problem, first, profiles[first], bases[0], absent)
     all_profiles = profiles | pairs
     trials = [t for kind in all_profiles if kind.keeps_A for t in _trials(all_profiles[kind])]
     best = min([*bases, *trials], key=lambda trial: trial.value)
@@ -313,7 +316,11 @@ def _preferred_element(profiles: dict[Kind, list[list[Trial]]], limit: float) ->
 
 
 def _pairs(
-    problem: Problem, first: Kind, profiles: list[list[Trial]], absent: tuple[str, ...]
+    problem: Problem,
+    first: Kind,
+    profiles: list[list[Trial]],
+    law: Trial,
+    absent: tuple[str, ...],
 ) -> dict[Kind, list[list[Trial]]]:
     """Return profiles of second effects beside an element, whose amplitude is an unknown.
 
@@ -321,9 +328,10 @@ def _pairs(
         problem, absent: see `compare_alternatives`.
         first: the element.
         profiles: of the element alone.
+        law: the fit without it.
     """
     at_best = min(_trials(profiles), key=lambda trial: trial.value)
-    problem, base = _with_free_amplitude(problem, first, at_best)
+    problem, base, origin = _with_free_amplitude(problem, first, at_best, law)
     if base is None:
         return {}
     found = {}
@@ -333,14 +341,14 @@ def _pairs(
                 name=f"{first.name}, and {second.name}",
                 parameters=(*first.parameters, *second.parameters),
             )
-            found[pair] = [_profile(problem, second, base)]
+            found[pair] = [_profile(problem, second, base, origin)]
     return found
 
 
 def _with_free_amplitude(
-    problem: Problem, kind: Kind, at_best: Trial
-) -> tuple[Problem, Trial | None]:
-    """Return the problem with an element whose amplitude is an unknown, and its fit."""
+    problem: Problem, kind: Kind, at_best: Trial, law: Trial
+) -> tuple[Problem, Trial | None, np.ndarray]:
+    """Return the problem with an element whose amplitude is an unknown, its fit, and its origin."""
     name = kind.parameters[0]
     # A law of impacts is that of drop tests, too; other elements belong to each curve.
     owners = problem.measurements if kind.changes_law else problem.curves
@@ -352,7 +360,8 @@ def _with_free_amplitude(
     start = [domain.to_free(x) for x in first.values()][: len(labels)]
     changed = _with_rate_error(problem, kind.rate_error(at_best.amplitude))
     both = replace(changed, unknowns=(*problem.unknowns, *unknowns), fixed=values)
-    return both, _trial(both, 0.0, np.append(at_best.flat, start))
+    origin = np.append(law.flat, start)
+    return both, _trial(both, 0.0, np.append(at_best.flat, start), origin), origin
 
 
 def _with_rate_error(problem: Problem, error: float) -> Problem:
@@ -409,9 +418,10 @@ class _Summary(NamedTuple):
         # At each amplitude -2 ln L is a parabola in the parameters. Where one of them matters so
         # little that its logarithm has a large error, it is a parabola in its value instead.
         half = np.sqrt(limit - inside[:, :1]) * inside[:, 2 + size :]
+        upwards = np.log1p(half + np.minimum(half**2 / 2, half))
         middle = inside[:, 2 : 2 + size]
         low = self._in_si(np.min(middle - half, axis=0), best)
-        high = self._in_si(np.max(middle + np.log1p(half + half**2 / 2), axis=0), best)
+        high = self._in_si(np.max(middle + upwards, axis=0), best)
         estimate = self.problem.estimates(best.flat)
         wider = 0.0
         if beside is not None:
@@ -448,7 +458,7 @@ class _Summary(NamedTuple):
 
 def _minima(problem: Problem, minima: list[Minimum]) -> list[Trial]:
     """Return the minima that the data allow as trials, the deepest one first."""
-    trials = [_trial(problem, 0.0, minimum.flat) for minimum in minima]
+    trials = [_trial(problem, 0.0, minimum.flat, minimum.flat) for minimum in minima]
     found = sorted((t for t in trials if t is not None), key=lambda trial: trial.value)
     different: list[Trial] = []
     for trial in found:
@@ -594,22 +604,35 @@ def constant_restitution(problem: Problem, trial: Trial) -> float:
     return float(gas.restitution(VARIANT_SPEED))
 
 
-def _trial(problem: Problem, amplitude: float, first: np.ndarray) -> Trial | None:
-    """Fit the unknowns of a problem; None if it cannot be computed."""
-    end = minimise(problem, first, MAX_STEPS, TRIAL_STEP)
+def _trial(
+    problem: Problem, amplitude: float, first: np.ndarray, origin: np.ndarray
+) -> Trial | None:
+    """Fit the unknowns of a problem, not farther than `farthest` from an origin.
+
+    Returns None if it cannot be computed.
+    """
+    limits = farthest(problem)
+    near = origin + np.clip(first - origin, -limits, limits)
+    end = minimise(problem, near, MAX_STEPS, TRIAL_STEP, origin)
     found = problem.evaluate(end.flat)
     if not found.is_finite:
         return None
-    variances = np.diag(np.linalg.pinv(found.information, hermitian=True))
-    error = np.sqrt(variances[: problem.num_free])
+    error = np.sqrt(np.diag(inverse(found.information))[: problem.num_free])
     step, length = newton_step(found)
     if length >= TRIAL_STEP:  # the search was cut short
         return Trial(amplitude, found.value, end.flat, error)
     return Trial(amplitude, found.value - length**2, end.flat + step, error)
 
 
-def _profile(problem: Problem, kind: Kind, base: Trial) -> list[Trial]:
-    """Return fits with increasing amplitudes, from 0, of an alternative."""
+def _profile(problem: Problem, kind: Kind, base: Trial, origin: np.ndarray) -> list[Trial]:
+    """Return fits with increasing amplitudes, from 0, of an alternative.
+
+    Args:
+        problem, kind: see `compare_alternatives`.
+        base: the fit without the alternative.
+        origin: of all searches: the fitted law. A search that began at the end of the one before
+            would go on to values of A that change nothing.
+    """
 
     def fit_with(amplitude: float, first: np.ndarray) -> Trial | None:
         fixed = {
@@ -618,7 +641,7 @@ def _profile(problem: Problem, kind: Kind, base: Trial) -> list[Trial]:
             if kind.changes_law or isinstance(m, CurveRows)
         }
         changed = _with_rate_error(problem, kind.rate_error(amplitude))
-        return _trial(replace(changed, fixed=fixed), amplitude, first)
+        return _trial(replace(changed, fixed=fixed), amplitude, first, origin)
 
     if not kind.keeps_A:
         trial = fit_with(kind.amplitudes[0][0], base.flat)

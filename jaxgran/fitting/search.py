@@ -120,7 +120,11 @@ def newton_step(found: Evaluation) -> tuple[np.ndarray, float]:
 
 
 def minimise(
-    problem: Problem, first: np.ndarray, max_steps: int, tolerance: float = LAST_STEP
+    problem: Problem,
+    first: np.ndarray,
+    max_steps: int,
+    tolerance: float = LAST_STEP,
+    origin: np.ndarray | None = None,
 ) -> Minimum:
     """Minimise -2 ln L from a first guess by Newton's method in a trust region.
 
@@ -131,8 +135,9 @@ def minimise(
         first: the first guess, in the unconstrained scale.
         max_steps: maximum number of steps.
         tolerance: length of a Newton step, in standard errors, at which the search ends.
+        origin: from which the unknowns may be `farthest`; by default the first guess.
     """
-    objective = _Objective(problem, first)
+    objective = _Objective(problem, first if origin is None else origin)
     if not np.isfinite(objective.value(first)):
         return Minimum(first, np.inf, 0, False)
     if objective.newton_length(first) < tolerance:
@@ -160,22 +165,26 @@ def minimise(
     return Minimum(end, objective.value(end), int(solution.nit), length < limit)
 
 
+def farthest(problem: Problem) -> Float[np.ndarray, "unknowns"]:
+    """Return how far the unknowns may be from the origin of a search."""
+    limits = [MAX_DISTANCE.get(u.name, MAX_DISTANCE_OF_OTHERS) for u in problem.unknowns]
+    return np.repeat(limits, [u.size for u in problem.unknowns])
+
+
 @dataclass(frozen=True)
 class _Objective:
-    """-2 ln L in the neighbourhood of a first guess."""
+    """-2 ln L in the neighbourhood of some unknowns."""
 
     problem: Problem
-    first: Float[np.ndarray, "unknowns"]
+    origin: Float[np.ndarray, "unknowns"]
 
     @cached_property
     def _farthest(self) -> Float[np.ndarray, "unknowns"]:
-        unknowns = self.problem.unknowns
-        limits = [MAX_DISTANCE.get(u.name, MAX_DISTANCE_OF_OTHERS) for u in unknowns]
-        return np.repeat(limits, [u.size for u in unknowns])
+        return farthest(self.problem)
 
     def value(self, flat: np.ndarray) -> float:
-        """Return -2 ln L; inf far from the first guess, and where it cannot be computed."""
-        if np.any(np.abs(flat - self.first) > self._farthest):
+        """Return -2 ln L; inf far from the origin, and where it cannot be computed."""
+        if np.any(np.abs(flat - self.origin) > self._farthest):
             return np.inf
         found = self.problem.evaluate(flat)
         return found.value if found.is_finite else np.inf

@@ -211,6 +211,26 @@ def test_the_range_holds_A_where_two_elements_are_not_told(elements, first, seco
     assert any(f"{first}, and {second} cannot be excluded" in x for x in result.reasons)
 
 
+@pytest.mark.slow
+def test_the_range_has_an_upper_end_where_walls_take_all_energy():
+    # A can be any small number, and a search must not follow it to values without information.
+    gas = glass_beads(0.09)
+    side = float(gas.box_side(250))
+    elastic = dataclasses.replace(
+        gas.replace(dissipative_constant=1e-9), container=jaxgran.Walls(side, restitution=0.9)
+    )
+    times = np.geomspace(5.0, 5e3, 30) * float(gas.mean_free_time)
+    T = np.asarray(jaxgran.cool(elastic, times).temperature)
+    T = T * np.exp(0.01 * np.random.default_rng(1).standard_normal(T.size))
+    curve = jaxgran.CoolingCurve(times, T, temperature_error=0.01 * T)
+    measurement = jaxgran.Measurement(gas, curve, num_particles=10_000)
+    result = jaxgran.fit(measurement, free=BOTH)
+    assert result.grade == "not consistent"
+    low, high = (float(x[0]) for x in result.ranges[A])
+    assert low < 1e-9 < high < 10 * float(result.estimate[0])
+
+
+@pytest.mark.slow
 def test_a_constant_restitution_is_named_and_A_has_no_meaning_then():
     gas = glass_beads(0.1)
     constant = dataclasses.replace(gas, law=jaxgran.ConstantRestitution(0.9))
