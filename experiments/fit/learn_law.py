@@ -132,7 +132,8 @@ def learn_law(options: Options) -> dict:
         measurement = of_lammps(name)
         # Without the start.
         after = jax.tree.map(lambda x: x[1:], temperature_only(measurement.curve))
-        learnt = learn(dataclasses.replace(measurement, data=after))
+        digits = {name: x[1:] for name, x in measurement.rounding.items()}
+        learnt = learn(dataclasses.replace(measurement, data=after, rounding=digits))
         worlds[f"LAMMPS, {name}"] = [judge(measurement.gas, learnt)]
     found = {name: summary(rows) for name, rows in worlds.items()}
     return {"worlds": found, "beads": summary(beads), "picture": draw(shown)}
