@@ -66,7 +66,7 @@ def pytest_configure(config):
         raise pytest.UsageError("--record needs all tests in one process: add -n 0")
     if not worker:
         os.environ["MPLBACKEND"] = "agg"  # no window
-        os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *FAST_COMPILATION])
+        os.environ["XLA_FLAGS"] = " ".join([*FAST_COMPILATION, os.environ.get("XLA_FLAGS", "")])
         for name in ("JAX_COMPILATION_CACHE_DIR", "JAXGRAN_NO_CACHE"):
             os.environ.pop(name, None)
         if PROGRAMS not in os.environ:

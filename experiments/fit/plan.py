@@ -127,23 +127,23 @@ def fitted(experiment: Planned) -> tuple[float, float]:
 def simulated(experiment: Planned, runs: int) -> Iterator[Planned]:
     """Yield an experiment as it is measured in each run."""
     if isinstance(experiment, jaxgran.Measurement):
-        yield from runs_of(experiment, runs)
+        yield from runs_of(experiment, runs, seed=0)
         return
-    each = {label: runs_of(m, runs) for label, m in experiment.items()}
+    each = {label: runs_of(m, runs, seed) for seed, (label, m) in enumerate(experiment.items())}
     for run in range(runs):
         yield {label: found[run] for label, found in each.items()}
 
 
-def runs_of(m: jaxgran.Measurement, runs: int) -> list[jaxgran.Measurement]:
+def runs_of(m: jaxgran.Measurement, runs: int, seed: int) -> list[jaxgran.Measurement]:
     """Return a measurement of each run, simulated with its noise."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     if isinstance(m.data, jaxgran.DropTest):
         error = np.asarray(m.data.error)
         exact = np.asarray(m.data.computed(m.gas))
         each = exact + error * rng.standard_normal((runs, error.size))
         drops = [dataclasses.replace(m.data, restitution=eps) for eps in each]
         return [dataclasses.replace(m, data=data) for data in drops]
-    curve = cool(m.gas, m.curve.times, jaxgran.HardSpheres(m.num_particles, replicas=runs))
+    curve = cool(m.gas, m.curve.times, jaxgran.HardSpheres(m.num_particles, replicas=runs), seed)
     fields = {}
     for name in ("temperature", "rotational_temperature"):
         error = getattr(m.curve, f"{name}_error")

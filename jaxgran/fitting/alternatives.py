@@ -26,7 +26,7 @@ from jaxgran.fitting.information import inverse
 from jaxgran.fitting.parameters import Unknown, as_floats, domain_of, with_parameters
 from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.rows import CurveRows
-from jaxgran.fitting.search import Minimum, farthest, minimise, newton_step
+from jaxgran.fitting.search import MAX_STEP, Minimum, farthest, minimise, newton_step
 from jaxgran.models.error_model import ROUGHNESS_ERROR, SLIDING_ERROR
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.laws import VARIANT_SPEED, VISCOELASTIC_EXPONENT
@@ -416,9 +416,11 @@ class _Summary(NamedTuple):
             limit = max(limit, self.best.value + ALLOWED_OVER_ALL)
         inside = values[values[:, 0] <= limit]
         # At each amplitude -2 ln L is a parabola in the parameters. Where one of them matters so
-        # little that its logarithm has a large error, it is a parabola in its value instead.
+        # little that its logarithm has a large error, it is a parabola in its value instead: the
+        # factor exp(h), for small h, becomes 1 + 2 h, which is more than 1 + h.
         half = np.sqrt(limit - inside[:, :1]) * inside[:, 2 + size :]
-        upwards = np.log1p(half + np.minimum(half**2 / 2, half))
+        of_positive = np.log1p(half + np.minimum(half**2 / 2, half))
+        upwards = np.where(self._is_logarithm, of_positive, half)
         middle = inside[:, 2 : 2 + size]
         low = self._in_si(np.min(middle - half, axis=0), best)
         high = self._in_si(np.max(middle + upwards, axis=0), best)
@@ -450,6 +452,15 @@ class _Summary(NamedTuple):
             error_reduction_needed=float(max(wider / DISTINGUISHABLE_SHARE, 1.0)),
             restitution=restitution,
         )
+
+    @property
+    def _is_logarithm(self) -> np.ndarray:
+        """Whether the unconstrained scale of a free parameter is a logarithm."""
+        size = self.problem.num_free
+        unknowns = self.problem.unknowns
+        domains = [u.domain for u in unknowns]
+        is_positive = [np.isfinite(x.low) and not np.isfinite(x.high) for x in domains]
+        return np.repeat(is_positive, [u.size for u in unknowns])[:size]
 
     def _in_si(self, free: np.ndarray, best: Trial) -> np.ndarray:
         with np.errstate(over="ignore"):
@@ -611,17 +622,20 @@ def _trial(
 
     Returns None if it cannot be computed.
     """
-    limits = farthest(problem)
-    near = origin + np.clip(first - origin, -limits, limits)
-    end = minimise(problem, near, MAX_STEPS, TRIAL_STEP, origin)
-    found = problem.evaluate(end.flat)
-    if not found.is_finite:
+    end = minimise(problem, first, MAX_STEPS, TRIAL_STEP, origin)
+    if not np.isfinite(end.value):
         return None
+    found = problem.evaluate(end.flat)
     error = np.sqrt(np.diag(inverse(found.information))[: problem.num_free])
     step, length = newton_step(found)
     if length >= TRIAL_STEP:  # the search was cut short
         return Trial(amplitude, found.value, end.flat, error)
-    return Trial(amplitude, found.value - length**2, end.flat + step, error)
+    # A longer step leaves the region in which -2 ln L is a parabola.
+    share = min(1.0, MAX_STEP / max(float(np.max(np.abs(step))), MAX_STEP))
+    fall = (2 * share - share**2) * length**2
+    limits = farthest(problem)
+    flat = origin + np.clip(end.flat + share * step - origin, -limits, limits)
+    return Trial(amplitude, found.value - fall, flat, error)
 
 
 def _profile(problem: Problem, kind: Kind, base: Trial, origin: np.ndarray) -> list[Trial]:

@@ -11,7 +11,12 @@ import numpy as np
 import scipy  # which imports scipy.stats at its first use
 
 from jaxgran.data.drop_test import DropTest
-from jaxgran.fitting.alternatives import DECLARABLE, Alternative, Explanations
+from jaxgran.fitting.alternatives import (
+    DECLARABLE,
+    DISTINGUISHABLE_SHARE,
+    Alternative,
+    Explanations,
+)
 from jaxgran.fitting.goodness import SIGNIFICANCE
 from jaxgran.fitting.result import CONDITIONAL, Fit
 from jaxgran.models.base import Limitation
@@ -55,9 +60,9 @@ MESSAGES = {
     "not converged": "The search did not converge: do not trust its estimates.",
     "not consistent": "{Model} {be} not consistent with this curve: do not trust the estimates."
     "{preferred} {remedy}",
-    "preferred": " The data prefer a model with {name}.",
-    "preferred value": " The data prefer a model with {name}, in which {symbol} = {estimate:.3g} "
-    "{unit}.",
+    "preferred": "The data prefer a model with {name}",
+    "preferred value": "The data prefer a model with {name}, in which {symbol} = {estimate:.3g} "
+    "{unit}",
     "not trusted": "{Model} cannot be trusted in this scene, though the curve fits. {remedy}",
     "determined": "{Model} {be} consistent with this curve, which determines {symbol}: {range}."
     "{edge}",
@@ -235,7 +240,8 @@ def _narrowing(result: Fit, explanations: Explanations) -> str:
     effects = sorted({x.effect for x in wide})
     low, high = explanations.ranges(without=wide)
     widest_low, widest_high = explanations.ranges()
-    if low[0] <= widest_low[0] and high[0] >= widest_high[0]:
+    gain = max(low[0] - widest_low[0], widest_high[0] - high[0])
+    if not gain > DISTINGUISHABLE_SHARE * abs(result.estimate[0]):
         return ""
     return say(
         "narrowing",
@@ -289,8 +295,8 @@ def _verdict(result: Fit, is_misfit: bool, limitations: tuple[Limitation, ...]) 
 def _preferred(result: Fit, best: Alternative) -> str:
     """Return a sentence on the best alternative, with a blank before it."""
     kind = "preferred" if best.restitution is not None else "preferred value"
-    estimate = float(best.estimate[0])
-    return MESSAGES[kind].format(name=best.name, estimate=estimate, **_unit_of(result))
+    words = say(kind, name=best.name, estimate=float(best.estimate[0]), **_unit_of(result))
+    return f" {words}."
 
 
 def say_edge(limitations: tuple[Limitation, ...]) -> str:

@@ -209,7 +209,7 @@ class CurveRows:
         )
 
     def noise(
-        self, times: np.ndarray, factor: Any = 1.0, white: float = 0.0, model: float = 1.0
+        self, times: np.ndarray, factor: Any, white: float = 0.0, model: float = 1.0
     ) -> Noise:
         """Return what makes the values scatter.
 

@@ -135,7 +135,7 @@ def minimise(
         first: the first guess, in the unconstrained scale.
         max_steps: maximum number of steps.
         tolerance: length of a Newton step, in standard errors, at which the search ends.
-        origin: from which the unknowns may be `farthest`; by default the first guess.
+        origin: no unknown moves farther from it than `farthest`; by default the first guess.
     """
     objective = _Objective(problem, first if origin is None else origin)
     if not np.isfinite(objective.value(first)):
@@ -157,12 +157,16 @@ def minimise(
             "max_trust_radius": 2 * MAX_STEP,
         },
     )
-    end = np.asarray(solution.x)
+    end = objective.nearest(np.asarray(solution.x))
+    value = objective.value(end)
     limit = max(tolerance, STALLED_STEP if ending.has_stalled else CONVERGED_STEP)
     step, length = newton_step(problem.evaluate(end))
     if length < CONVERGED_STEP:
-        end = end + step
-    return Minimum(end, objective.value(end), int(solution.nit), length < limit)
+        further = objective.nearest(end + step)
+        if objective.value(further) < value + MIN_FALL_OF_STEP:
+            end = further
+            value = objective.value(further)
+    return Minimum(end, value, int(solution.nit), length < limit)
 
 
 def farthest(problem: Problem) -> Float[np.ndarray, "unknowns"]:
@@ -173,7 +177,7 @@ def farthest(problem: Problem) -> Float[np.ndarray, "unknowns"]:
 
 @dataclass(frozen=True)
 class _Objective:
-    """-2 ln L in the neighbourhood of some unknowns."""
+    """-2 ln L as a function of unknowns that are moved to the region around an origin."""
 
     problem: Problem
     origin: Float[np.ndarray, "unknowns"]
@@ -182,25 +186,40 @@ class _Objective:
     def _farthest(self) -> Float[np.ndarray, "unknowns"]:
         return farthest(self.problem)
 
+    def nearest(self, flat: np.ndarray) -> np.ndarray:
+        """Return the nearest unknowns that are not farther from the origin than `farthest`."""
+        return self.origin + np.clip(flat - self.origin, -self._farthest, self._farthest)
+
+    def evaluate(self, flat: np.ndarray) -> Evaluation:
+        """Return -2 ln L at the nearest unknowns; it does not depend on those outside."""
+        near = self.nearest(flat)
+        found = self.problem.evaluate(near)
+        outside = np.abs(flat - self.origin) > self._farthest
+        if not np.any(outside):
+            return found
+        inside = np.outer(~outside, ~outside)
+        information = np.where(inside, found.information, np.diag(outside.astype(float)))
+        return found._replace(
+            gradient=np.where(outside, 0.0, found.gradient), information=information
+        )
+
     def value(self, flat: np.ndarray) -> float:
-        """Return -2 ln L; inf far from the origin, and where it cannot be computed."""
-        if np.any(np.abs(flat - self.origin) > self._farthest):
-            return np.inf
-        found = self.problem.evaluate(flat)
+        """Return -2 ln L; inf where it cannot be computed."""
+        found = self.evaluate(flat)
         return found.value if found.is_finite else np.inf
 
     def gradient(self, flat: np.ndarray) -> np.ndarray:
         """Return its first derivatives."""
-        return np.nan_to_num(self.problem.evaluate(flat).gradient)
+        return np.nan_to_num(self.evaluate(flat).gradient)
 
     def hessian(self, flat: np.ndarray) -> np.ndarray:
         """Return its expected second derivatives."""
-        found = self.problem.evaluate(flat)
+        found = self.evaluate(flat)
         return 2 * found.information if found.is_finite else np.eye(flat.size)
 
     def newton_length(self, flat: np.ndarray) -> float:
         """Return the length of the next Newton step, in standard errors."""
-        return newton_step(self.problem.evaluate(flat))[1]
+        return newton_step(self.evaluate(flat))[1]
 
 
 @dataclass
@@ -210,13 +229,13 @@ class _Ending:
     Attributes:
         objective: of the search.
         tolerance: length of a short step, in standard errors.
-        lowest: -2 ln L after the last step.
+        last: -2 ln L after the step before.
         num_stalled: number of steps in succession that hardly lowered it.
     """
 
     objective: _Objective
     tolerance: float
-    lowest: float = np.inf
+    last: float = np.inf
     num_stalled: int = 0
 
     @property
@@ -226,9 +245,9 @@ class _Ending:
 
     def __call__(self, flat: np.ndarray) -> None:
         value = self.objective.value(flat)
-        has_fallen = value <= self.lowest - MIN_FALL_OF_STEP
+        has_fallen = value <= self.last - MIN_FALL_OF_STEP
         self.num_stalled = 0 if has_fallen else self.num_stalled + 1
-        self.lowest = value
+        self.last = value
         if self.objective.newton_length(flat) < self.tolerance or self.has_stalled:
             raise StopIteration
 
@@ -289,9 +308,9 @@ class Descent:
         objective = _Objective(problem, first)
 
         def loss(flat: np.ndarray, step: int) -> Loss:
-            if not np.isfinite(objective.value(flat)):
+            found = objective.evaluate(flat)
+            if not found.is_finite:
                 return Loss(np.inf, np.zeros_like(flat))
-            found = problem.evaluate(flat)
             return Loss(found.value, found.gradient, newton_step(found)[1] < LAST_STEP)
 
         size = sum(row.values.size for row in problem.evaluate(first).rows)

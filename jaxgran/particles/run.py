@@ -351,10 +351,10 @@ def _record_all(
                     values[num_done] = x
                 write(num_done, state)
                 num_done += 1
+            save(_Reached(num_done, state, records))
         except KeyboardInterrupt:
             save(_Reached(num_done, state, records))
             raise
-    save(_Reached(num_done, state, records))
     return _Reached(num_done, state, records)
 
 
