@@ -9,7 +9,8 @@
   `simulated_fit` its result.
 - `estimate`, `result`: the estimate with its errors by cause (`information`), and `Fit`.
 - `goodness`, `outliers`: tests of the fit, and far values.
-- `alternatives`: alternative explanations of a curve, and the range of the parameters over them.
+- `alternatives`: alternative explanations of a curve, and the range of the parameters over them;
+  `kinds` is the table of them, `profiles` the fits with each.
 - `messages`, `report`: what a fit says.
 - `learnt_law`: eps(v) of a fitted law, with its band.
 - `plan`, `candidates`, `twins`: the range to expect of an experiment, additions to it, and curves

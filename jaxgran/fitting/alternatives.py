@@ -11,35 +11,28 @@ Where the data prefer an element, the same is done with a second effect beside i
 allows for one effect more than the data show.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy
 from jaxtyping import Float
 
-from jaxgran.data.measurement import START_TIME
-from jaxgran.fitting.comparison import FLOOR, WHITE
 from jaxgran.fitting.goodness import SIGNIFICANCE, goodness
-from jaxgran.fitting.information import inverse
+from jaxgran.fitting.kinds import DECLARABLE, SCENE_PARAMETERS, Kind, kinds_of
 from jaxgran.fitting.parameters import Unknown, as_floats, domain_of, with_parameters
 from jaxgran.fitting.problem import Problem
-from jaxgran.fitting.rows import CurveRows
-from jaxgran.fitting.search import MAX_STEP, Minimum, farthest, minimise, newton_step
-from jaxgran.models.error_model import ROUGHNESS_ERROR, SLIDING_ERROR
-from jaxgran.scene.gas import Gas
-from jaxgran.scene.laws import VARIANT_SPEED, VISCOELASTIC_EXPONENT
-
-ALLOWED = 3.84
-"""Increase of -2 ln L over that of the law up to which its own parameters are allowed (5 % by
-chance)."""
-
-ALLOWED_OVER_ALL = 3.84
-"""The same of all explanations over the best one."""
-
-EXCLUDED = 4 * ALLOWED
-"""Increase beyond which larger amplitudes are not tried."""
+from jaxgran.fitting.profiles import (
+    ALLOWED,
+    ALLOWED_OVER_ALL,
+    Trial,
+    profile_of,
+    trial_of,
+    with_wider_rate_error,
+)
+from jaxgran.fitting.search import Minimum
+from jaxgran.scene.laws import VARIANT_SPEED
 
 PREFERENCE_LEVEL = 0.01
 """Probability by chance of any alternative being preferred."""
@@ -47,126 +40,8 @@ PREFERENCE_LEVEL = 0.01
 DISTINGUISHABLE_SHARE = 0.1
 """Relative change of an estimate below which an allowed alternative is negligible."""
 
-SHARES = (0.05, 0.15, 0.35, 0.6, 0.85, 0.97)
-"""Amplitudes of walls, as shares of the initial cooling rate, and of a noise floor, as shares of
-the lowest computed temperature."""
-
-DRAG_SHARES = (0.001, 0.005, 0.02, 0.06, 0.2, 0.5, 0.9)
-"""Amplitudes of drag, as shares of the initial cooling rate; its share grows as the gas cools."""
-
-ROUGHNESS = (0.02, 0.08, 0.25, 0.6, 1.0, 1.4, 1.75, 1.9)
-"""Values of 1 + beta_t of rough spheres."""
-
-SLIDING = (0.3, 1.0, 2.5, 6.0, 15.0)
-"""Values of 1/mu of rough spheres that slide."""
-
-FRICTION = (0.02, 0.04, 0.06, 0.15, 0.4, 1.0)
-"""Values of mu of smooth spheres that become rough and slide."""
-
-STICKING_RESTITUTION = 0.44
-"""beta_t of these, where they stick: that of glass (.44) and acetate (.43) beads, Foerster et al.,
-Phys. Fluids 6, 1108 (1994)."""
-
-DELAYS = (0.003, 0.02, 0.1, 0.3)
-"""Errors of the start of the clock, over the initial cooling time, of both signs."""
-
-SPREADS = (0.02, 0.05, 0.1, 0.15)
-"""Standard deviations of eps from impact to impact."""
-
-WHITE_ERRORS = (0.002, 0.006, 0.02, 0.06)
-"""Relative standard deviations of independent errors of T."""
-
-NUM_REFINED = 2
-"""Number of amplitudes tried between the last allowed one and the first excluded one, and around
-each minimum."""
-
-MIN_DROP = 0.25
-"""Depth of a minimum among three amplitudes, and by their parabola below the least of them, over
-`ALLOWED`, below which none is tried."""
-
-BARRIER = 5.0
-"""Factor of `EXCLUDED` for alternatives whose -2 ln L may have a second minimum."""
-
-MIN_SPACING = 0.05
-"""Least distance of the latter from those tried, over the distance of these."""
-
-WALL_RESTITUTION = 0.5
-"""Restitution of the walls of an alternative; the side of the box is its amplitude."""
-
-WALL_RATE_ERROR = 0.007
-"""Relative error of theory's mean cooling rate until T has fallen to a fifth, if walls take all of
-the energy (`jaxgran.models.error_model.WALL_ERROR`)."""
-
-MIN_WALL_SIDE = 4.0
-"""Smallest side of that box, in diameters."""
-
-MAX_STEPS = 20
-"""Maximum number of steps of a search."""
-
 THEORY_TOLERANCE = 1e3
 """Factor of the tolerance of kinetic theory."""
-
-TRIAL_STEP = 1.0
-"""Length of a Newton step, in standard errors, that is the last one of a trial: it is taken without
-another curve, and -2 ln L is then known to .1."""
-
-DECLARABLE = {
-    "walls": ("wall_side", "container_side, wall_restitution"),
-    "roughness": ("tangential_restitution", "beta_t, T_rot"),
-    "drag": ("drag_rate", "gamma"),
-    "friction": ("friction", "friction"),
-}
-"""Parameter of each of the effects `jaxgran.data.header.ABSENT`, and what describes it in a
-file."""
-
-
-SCENE_PARAMETERS = tuple(parameter for parameter, _ in DECLARABLE.values())
-"""The parameters of elements of a scene, beside which second effects are tried."""
-
-WALLS_ADDED = "walls that dissipate energy"
-DRAG_ADDED = "linear drag, as in air"
-ROUGHNESS_ADDED = "rough grains without initial rotation"
-"""Names of alternatives that add one element to the scene."""
-
-
-class Kind(NamedTuple):
-    """Kind of alternative.
-
-    Attributes:
-        name: in words.
-        parameters: the parameters that it adds; the first one identifies the effect.
-        amplitudes: values that are tried, in one or two increasing sequences from 0.
-        values: values of parameters at an amplitude, given the label of the measurement.
-        rate_error: relative error of kinetic theory's cooling rate by it, at an amplitude.
-        one_minimum: False if amplitudes beyond excluded ones may be allowed.
-        changes_law: whether it is in the law of impacts, which drop tests obey, too.
-        keeps_A: False if A has no meaning in it: it is not part of the range.
-    """
-
-    name: str
-    parameters: tuple[str, ...]
-    amplitudes: tuple[tuple[float, ...], ...]
-    values: Callable[[float, str], dict[str, float]]
-    rate_error: Callable[[float], float] = lambda amplitude: 0.0
-    one_minimum: bool = True
-    changes_law: bool = False
-    keeps_A: bool = True
-
-
-class Trial(NamedTuple):
-    """Fit of all unknowns with one amplitude of an alternative.
-
-    Attributes:
-        amplitude: of the alternative.
-        value: -2 ln L.
-        flat: the unknowns, in their unconstrained scale.
-        error: standard errors of the free parameters in this scale.
-    """
-
-    amplitude: float
-    value: float
-    flat: Float[np.ndarray, "unknowns"]
-    error: Float[np.ndarray, "p"]
 
 
 class Alternative(NamedTuple):
@@ -273,14 +148,14 @@ def compare_alternatives(
     bases = _minima(problem, minima)
     if not bases:
         return None
-    kinds = [] if is_driven else _kinds(problem, bases[0].flat, absent)
+    kinds = [] if is_driven else kinds_of(problem, bases[0].flat, absent)
     significant = float(scipy.stats.chi2.isf(PREFERENCE_LEVEL / max(len(kinds), 1), 1))
     found = problem.evaluate(bases[0].flat)
     if goodness(problem, found)["smooth_p_value"] < SIGNIFICANCE / 2:
         # Such a curve prefers whatever has less noise.
         significant = np.inf
     profiles = {
-        kind: [_profile(problem, kind, base, base.flat) for base in bases] for kind in kinds
+        kind: [profile_of(problem, kind, base, base.flat) for base in bases] for kind in kinds
     }
     first = _preferred_element(profiles, bases[0].value - significant)
     pairs = {} if first is None else _pairs(problem, first, profiles[first], bases[0], absent)
@@ -335,13 +210,13 @@ def _pairs(
     if base is None:
         return {}
     found = {}
-    for second in _kinds(problem, base.flat, absent):
+    for second in kinds_of(problem, base.flat, absent):
         if second.keeps_A:
             pair = second._replace(
                 name=f"{first.name}, and {second.name}",
                 parameters=(*first.parameters, *second.parameters),
             )
-            found[pair] = [_profile(problem, second, base, origin)]
+            found[pair] = [profile_of(problem, second, base, origin)]
     return found
 
 
@@ -358,22 +233,10 @@ def _with_free_amplitude(
     labels = [None] if kind.changes_law else [m.label for m in problem.curves]
     unknowns = [Unknown(name, label, (), domain) for label in labels]
     start = [domain.to_free(x) for x in first.values()][: len(labels)]
-    changed = _with_rate_error(problem, kind.rate_error(at_best.amplitude))
+    changed = with_wider_rate_error(problem, kind.rate_error(at_best.amplitude))
     both = replace(changed, unknowns=(*problem.unknowns, *unknowns), fixed=values)
     origin = np.append(law.flat, start)
-    return both, _trial(both, 0.0, np.append(at_best.flat, start), origin), origin
-
-
-def _with_rate_error(problem: Problem, error: float) -> Problem:
-    """Return a problem with a larger error of the cooling rate of its model."""
-
-    def widened(m: Any) -> Any:
-        if not isinstance(m, CurveRows):
-            return m
-        times, known = m.rate_error
-        return replace(m, rate_error=(times, known + error))
-
-    return replace(problem, measurements=tuple(widened(m) for m in problem.measurements))
+    return both, trial_of(both, 0.0, np.append(at_best.flat, start), origin), origin
 
 
 class _Summary(NamedTuple):
@@ -469,7 +332,7 @@ class _Summary(NamedTuple):
 
 def _minima(problem: Problem, minima: list[Minimum]) -> list[Trial]:
     """Return the minima that the data allow as trials, the deepest one first."""
-    trials = [_trial(problem, 0.0, minimum.flat, minimum.flat) for minimum in minima]
+    trials = [trial_of(problem, 0.0, minimum.flat, minimum.flat) for minimum in minima]
     found = sorted((t for t in trials if t is not None), key=lambda trial: trial.value)
     different: list[Trial] = []
     for trial in found:
@@ -480,132 +343,6 @@ def _minima(problem: Problem, minima: list[Minimum]) -> list[Trial]:
     return different
 
 
-def _kinds(problem: Problem, flat: np.ndarray, absent: tuple[str, ...]) -> list[Kind]:
-    """Return the kinds of alternatives to a fit."""
-    if not problem.curves:
-        return []
-    scenes = {m.label: m.scene for m in problem.curves}
-    values = problem.values(flat)
-    curves = problem.evaluate(flat).curves
-    rates = {m.label: _initial_rate(m, values[m.label], curves[m.label]) for m in problem.curves}
-    lowest = {
-        m.label: float(np.min(curves[m.label]["temperature"][m.used[:, 0] > 0]))
-        for m in problem.curves
-    }
-
-    def walls(share: float, label: str) -> dict[str, float]:
-        side = side_of_walls(scenes[label], share * rates[label])
-        return {"wall_side": side, "wall_coefficient": WALL_RESTITUTION}
-
-    beta_t = "tangential_restitution"
-    possible = [
-        Kind(
-            WALLS_ADDED,
-            ("wall_side",),
-            (SHARES,),
-            walls,
-            lambda share: WALL_RATE_ERROR * share,
-        ),
-        Kind(
-            DRAG_ADDED,
-            ("drag_rate",),
-            (DRAG_SHARES,),
-            lambda share, label: {"drag_rate": share * rates[label] / 2},
-        ),
-        Kind(
-            "a noise floor in T", (FLOOR,), (SHARES,), lambda x, label: {FLOOR: x * lowest[label]}
-        ),
-        Kind("independent errors of T", (WHITE,), (WHITE_ERRORS,), lambda x, label: {WHITE: x}),
-        Kind(
-            ROUGHNESS_ADDED,
-            (beta_t,),
-            (ROUGHNESS,),
-            lambda x, label: {beta_t: x - 1},
-            lambda x: ROUGHNESS_ERROR * min(x, 1.0),
-        ),
-        Kind(
-            "rough grains that slide",
-            (beta_t, "friction"),
-            (FRICTION,),
-            lambda x, label: {beta_t: STICKING_RESTITUTION, "friction": x},
-            lambda x: SLIDING_ERROR * x,
-            one_minimum=False,
-        ),
-    ]
-    if all(beta_t in gas.domains for gas in scenes.values()):
-        sliding = Kind(
-            "grains that slide",
-            ("friction",),
-            (SLIDING,),
-            lambda x, label: {"friction": 1 / x},
-            changes_law=True,
-        )
-        possible.append(sliding)
-    known = {u.name for u in problem.unknowns}
-    if all("exponent" in m.gas.domains for m in problem.curves):
-        spread = Kind(
-            "eps that scatters from impact to impact",
-            ("spread",),
-            (SPREADS,),
-            lambda x, label: {"spread": x},
-            changes_law=True,
-        )
-        constant = Kind(
-            "a constant coefficient of restitution",
-            ("exponent",),
-            ((1.0,),),
-            lambda x, label: {"exponent": VISCOELASTIC_EXPONENT * (1 - x)},
-            changes_law=True,
-            keeps_A=False,
-        )
-        possible.append(spread)
-        if "dissipative_constant" in known:
-            possible.append(constant)
-    if not known & {START_TIME, "temperature"}:
-        delay = Kind(
-            "an error of the start time or of T_0",
-            (START_TIME,),
-            (DELAYS, tuple(-x for x in DELAYS)),
-            lambda share, label: {START_TIME: -share / rates[label]},
-        )
-        possible.append(delay)
-    if all(np.any(m.errors[:, 0] > 0) for m in problem.curves):
-        known.add(WHITE)
-    known |= {DECLARABLE[name][0] for name in absent}
-    known |= {name for gas in scenes.values() for name in gas.domains}
-    supported = {FLOOR, WHITE, START_TIME}.union(*(m.gas.domains for m in problem.curves))
-    for m in problem.curves:  # spheres of unequal sizes have neither walls nor roughness
-        supported &= {FLOOR, WHITE, START_TIME, *m.gas.domains}
-    return [
-        kind
-        for kind in possible
-        if known.isdisjoint(kind.parameters) and supported.issuperset(kind.parameters)
-    ]
-
-
-def side_of_walls(gas: Gas, rate: float) -> float:
-    """Return the side of a box whose walls, of restitution `WALL_RESTITUTION`, cool a gas.
-
-    Args:
-        gas: the gas.
-        rate: cooling rate by the walls at the start, 1/s.
-    """
-    flux = 2 * np.sqrt(float(gas.temperature) / (2 * np.pi))
-    side = 2 * (1 - WALL_RESTITUTION**2) * flux / max(rate, 1e-300) + float(gas.diameter)
-    return max(side, MIN_WALL_SIDE * float(gas.diameter))
-
-
-def _initial_rate(m: CurveRows, values: dict[str, Any], curve: dict[str, Any]) -> float:
-    """Return the cooling rate at the start of a fitted curve, from the time in which T halves."""
-    T_0 = float(values.get("temperature", m.scene.temperature))
-    times = np.asarray(m.curve.times) - float(values.get(START_TIME, 0.0))
-    log_T = np.log(curve["temperature"] / T_0)
-    fallen = np.flatnonzero((log_T < -np.log(2)) & (times > 0))
-    at = fallen[0] if fallen.size else -1
-    cooled = np.expm1(-0.6 * min(log_T[at], -1e-6))  # 1 + t/tau = T^(-3/5)
-    return float(5 / 3 * cooled / max(times[at], 1e-300))
-
-
 def constant_restitution(problem: Problem, trial: Trial) -> float:
     """Return eps of a trial in which it is constant."""
     m = problem.curves[0]
@@ -613,124 +350,3 @@ def constant_restitution(problem: Problem, trial: Trial) -> float:
     known = {name: x for name, x in values.items() if name in m.gas.domains}
     gas = with_parameters(m.gas, as_floats(known | {"exponent": 0.0}))
     return float(gas.restitution(VARIANT_SPEED))
-
-
-def _trial(
-    problem: Problem, amplitude: float, first: np.ndarray, origin: np.ndarray
-) -> Trial | None:
-    """Fit the unknowns of a problem, not farther than `farthest` from an origin.
-
-    Returns None if it cannot be computed.
-    """
-    end = minimise(problem, first, MAX_STEPS, TRIAL_STEP, origin)
-    if not np.isfinite(end.value):
-        return None
-    found = problem.evaluate(end.flat)
-    error = np.sqrt(np.diag(inverse(found.information))[: problem.num_free])
-    step, length = newton_step(found)
-    if length >= TRIAL_STEP:  # the search was cut short
-        return Trial(amplitude, found.value, end.flat, error)
-    # A longer step leaves the region in which -2 ln L is a parabola.
-    share = min(1.0, MAX_STEP / max(float(np.max(np.abs(step))), MAX_STEP))
-    fall = (2 * share - share**2) * length**2
-    limits = farthest(problem)
-    flat = origin + np.clip(end.flat + share * step - origin, -limits, limits)
-    return Trial(amplitude, found.value - fall, flat, error)
-
-
-def _profile(problem: Problem, kind: Kind, base: Trial, origin: np.ndarray) -> list[Trial]:
-    """Return fits with increasing amplitudes, from 0, of an alternative.
-
-    Args:
-        problem, kind: see `compare_alternatives`.
-        base: the fit without the alternative.
-        origin: of all searches: the fitted law. A search that began at the end of the one before
-            would go on to values of A that change nothing.
-    """
-
-    def fit_with(amplitude: float, first: np.ndarray) -> Trial | None:
-        fixed = {
-            m.label: problem.fixed.get(m.label, {}) | kind.values(amplitude, m.label)
-            for m in problem.measurements
-            if kind.changes_law or isinstance(m, CurveRows)
-        }
-        changed = _with_rate_error(problem, kind.rate_error(amplitude))
-        return _trial(replace(changed, fixed=fixed), amplitude, first, origin)
-
-    if not kind.keeps_A:
-        trial = fit_with(kind.amplitudes[0][0], base.flat)
-        return [base] if trial is None else [base, trial]
-    trials = [base]
-    lowest = base.value
-    for sequence in kind.amplitudes:
-        before = base
-        previous = None
-        for amplitude in sequence:
-            first = before.flat
-            if previous is not None:
-                slope = (before.flat - previous.flat) / (before.amplitude - previous.amplitude)
-                first = before.flat + np.clip(slope * (amplitude - before.amplitude), -1.0, 1.0)
-            trial = fit_with(amplitude, first)
-            if trial is None:
-                break
-            trials.append(trial)
-            lowest = min(lowest, trial.value)
-            if trial.value > lowest + ALLOWED_OVER_ALL:
-                trials += _at_the_limit(fit_with, before, trial, lowest)
-            previous = before
-            before = trial
-            excluded = EXCLUDED * (1.0 if kind.one_minimum else BARRIER)
-            if trial.value > lowest + excluded:
-                break
-    for _ in range(NUM_REFINED):
-        trials.sort(key=lambda trial: trial.amplitude)
-        threes = [trials[k - 1 : k + 2] for k in range(1, len(trials) - 1)]
-        lowest_of_three = [x for x in threes if x[1].value < min(x[0].value, x[2].value)]
-        found = [_at_the_vertex(fit_with, three) for three in lowest_of_three]
-        trials += [trial for trial in found if trial is not None]
-    return sorted(trials, key=lambda trial: trial.amplitude)
-
-
-def _at_the_vertex(
-    fit_with: Callable[[float, np.ndarray], Trial | None], three: list[Trial]
-) -> Trial | None:
-    """Return the fit at the vertex of the parabola through a minimum of -2 ln L, or on its side."""
-    x = np.array([trial.amplitude for trial in three])
-    value = np.array([trial.value for trial in three])
-    curvature, slope, _ = np.polyfit(x - x[1], value, 2)
-    drop = max(np.min(np.delete(value, 1)) - value[1], slope**2 / (4 * curvature))
-    if drop < MIN_DROP * ALLOWED:
-        return None
-    vertex = x[1] - slope / (2 * curvature)
-    if np.min(np.abs(vertex - x)) <= MIN_SPACING * (x[2] - x[0]):
-        vertex = (x[1] + (x[2] if vertex > x[1] else x[0])) / 2
-    return fit_with(vertex, three[1].flat)
-
-
-def _at_the_limit(
-    fit_with: Callable[[float, np.ndarray], Trial | None],
-    low: Trial,
-    high: Trial,
-    least: float,
-) -> list[Trial]:
-    """Return fits near the amplitude at which -2 ln L, a parabola, exceeds its least value by
-    `ALLOWED_OVER_ALL`.
-
-    The last one comes within a quarter of this increase, if `NUM_REFINED` are enough.
-    """
-    increase = ALLOWED_OVER_ALL
-    trials = []
-    while low.value <= least + increase < high.value and len(trials) < NUM_REFINED:
-        at_low = np.sqrt(low.value - least)
-        at_high = np.sqrt(high.value - least)
-        share = float(np.clip((np.sqrt(increase) - at_low) / (at_high - at_low), 0.05, 0.95))
-        amplitude = low.amplitude + share * (high.amplitude - low.amplitude)
-        trial = fit_with(amplitude, low.flat + share * (high.flat - low.flat))
-        if trial is None:
-            break
-        trials.append(trial)
-        least = min(least, trial.value)
-        if abs(trial.value - least - increase) < increase / 4:
-            break
-        low, high = (trial, high) if trial.value <= least + increase else (low, trial)
-    return trials

@@ -11,13 +11,9 @@ import numpy as np
 import scipy  # which imports scipy.stats at its first use
 
 from jaxgran.data.drop_test import DropTest
-from jaxgran.fitting.alternatives import (
-    DECLARABLE,
-    DISTINGUISHABLE_SHARE,
-    Alternative,
-    Explanations,
-)
+from jaxgran.fitting.alternatives import DISTINGUISHABLE_SHARE, Alternative, Explanations
 from jaxgran.fitting.goodness import SIGNIFICANCE
+from jaxgran.fitting.kinds import DECLARABLE
 from jaxgran.fitting.result import CONDITIONAL, Fit
 from jaxgran.models.base import Limitation
 from jaxgran.scene.parameters import symbol_of, unit_of

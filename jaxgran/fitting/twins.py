@@ -9,12 +9,12 @@ import numpy as np
 from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import START_TIME, Measurement
-from jaxgran.fitting.alternatives import (
+from jaxgran.fitting.alternatives import Alternative
+from jaxgran.fitting.kinds import (
     DRAG_ADDED,
     ROUGHNESS_ADDED,
     WALL_RESTITUTION,
     WALLS_ADDED,
-    Alternative,
     side_of_walls,
 )
 from jaxgran.fitting.parameters import as_floats, halving_time, with_parameters
