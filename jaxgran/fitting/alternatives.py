@@ -239,6 +239,19 @@ def _with_free_amplitude(
     return both, trial_of(both, 0.0, np.append(at_best.flat, start), origin), origin
 
 
+class _Allowed(NamedTuple):
+    """Amplitudes that the data allow, and the ranges of the parameters at each of them.
+
+    Attributes:
+        amplitude: shape (amplitudes,).
+        low, high: ends of the range of each free parameter, in its unconstrained scale.
+    """
+
+    amplitude: Float[np.ndarray, "amplitudes"]
+    low: Float[np.ndarray, "amplitudes p"]
+    high: Float[np.ndarray, "amplitudes p"]
+
+
 class _Summary(NamedTuple):
     """What the trials of each alternative are compared with: see `compare_alternatives`."""
 
@@ -258,35 +271,15 @@ class _Summary(NamedTuple):
             profiles: the trials, from each minimum.
             beside: what it is added to: the law, or an element; None for the law itself.
         """
-        size = self.problem.num_free
-        rows = []
-        for trials in profiles:
-            values = np.array(
-                [
-                    [t.value, t.amplitude, *t.flat[:size], *np.hypot(t.error, self.noise)]
-                    for t in trials
-                ]
-            )
-            fine = np.linspace(0, len(trials) - 1, 40 * (len(trials) - 1) + 1)
-            known = np.arange(len(trials))
-            rows.append(np.stack([np.interp(fine, known, column) for column in values.T], axis=1))
         # The law without an alternative is not a trial of one that has no amplitudes in between.
         ends = [trials if kind is None or kind.keeps_A else trials[1:] for trials in profiles]
         best = min((t for trials in ends for t in trials), key=lambda t: t.value, default=self.base)
-        values = np.concatenate(rows)
         limit = best.value + ALLOWED
         if kind is not None:
             limit = max(limit, self.best.value + ALLOWED_OVER_ALL)
-        inside = values[values[:, 0] <= limit]
-        # At each amplitude -2 ln L is a parabola in the parameters. Where one of them matters so
-        # little that its logarithm has a large error, it is a parabola in its value instead: the
-        # factor exp(h), for small h, becomes 1 + 2 h, which is more than 1 + h.
-        half = np.sqrt(limit - inside[:, :1]) * inside[:, 2 + size :]
-        of_positive = np.log1p(half + np.minimum(half**2 / 2, half))
-        upwards = np.where(self._is_logarithm, of_positive, half)
-        middle = inside[:, 2 : 2 + size]
-        low = self._in_si(np.min(middle - half, axis=0), best)
-        high = self._in_si(np.max(middle + upwards, axis=0), best)
+        allowed = self._allowed(profiles, limit)
+        low = self._in_si(np.min(allowed.low, axis=0), best)
+        high = self._in_si(np.max(allowed.high, axis=0), best)
         estimate = self.problem.estimates(best.flat)
         wider = 0.0
         if beside is not None:
@@ -305,7 +298,7 @@ class _Summary(NamedTuple):
             name="" if kind is None else kind.name,
             effect=next((name for name, x in DECLARABLE.items() if x[0] == parameter), ""),
             amplitude=best.amplitude,
-            allowed=(float(np.min(inside[:, 1])), float(np.max(inside[:, 1]))),
+            allowed=(float(np.min(allowed.amplitude)), float(np.max(allowed.amplitude))),
             improvement=float(improvement),
             estimate=estimate,
             low=low,
@@ -314,6 +307,34 @@ class _Summary(NamedTuple):
             distinguishable=bool(wider < DISTINGUISHABLE_SHARE),
             error_reduction_needed=float(max(wider / DISTINGUISHABLE_SHARE, 1.0)),
             restitution=restitution,
+        )
+
+    def _allowed(self, profiles: list[list[Trial]], limit: float) -> _Allowed:
+        """Return what the data allow below a limit of -2 ln L, interpolated between the trials."""
+        size = self.problem.num_free
+        rows = []
+        for trials in profiles:
+            values = np.array(
+                [
+                    [t.value, t.amplitude, *t.flat[:size], *np.hypot(t.error, self.noise)]
+                    for t in trials
+                ]
+            )
+            fine = np.linspace(0, len(trials) - 1, 40 * (len(trials) - 1) + 1)
+            known = np.arange(len(trials))
+            rows.append(np.stack([np.interp(fine, known, column) for column in values.T], axis=1))
+        values = np.concatenate(rows)
+        inside = values[values[:, 0] <= limit]
+        # At each amplitude -2 ln L is a parabola in the parameters. Where one of them matters so
+        # little that its logarithm has a large error, it is a parabola in its value instead: the
+        # factor exp(h), for small h, becomes 1 + 2 h, which is more than 1 + h.
+        half = np.sqrt(limit - inside[:, :1]) * inside[:, 2 + size :]
+        of_positive = np.log1p(half + np.minimum(half**2 / 2, half))
+        middle = inside[:, 2 : 2 + size]
+        return _Allowed(
+            amplitude=inside[:, 1],
+            low=middle - half,
+            high=middle + np.where(self._is_logarithm, of_positive, half),
         )
 
     @property
