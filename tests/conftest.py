@@ -21,7 +21,10 @@ MAX_MAPS = 40_000
 message if it gets no further map."""
 
 FAST_COMPILATION = ["--xla_backend_optimization_level=0"]
-"""Flags of XLA. Tests mostly compile, in three fifths of the time with them."""
+"""Flags of XLA for the default tests, which mostly compile: in three fifths of the time with them.
+
+Long tests run at the level that users have: some of them compare numbers to round-off.
+"""
 
 if tuple(map(int, version("jax").split(".")[:2])) < (0, 11):
     FAST_COMPILATION.append("--xla_cpu_use_fusion_emitters=false")
@@ -66,7 +69,9 @@ def pytest_configure(config):
         raise pytest.UsageError("--record needs all tests in one process: add -n 0")
     if not worker:
         os.environ["MPLBACKEND"] = "agg"  # no window
-        os.environ["XLA_FLAGS"] = " ".join([*FAST_COMPILATION, os.environ.get("XLA_FLAGS", "")])
+        if config.option.markexpr == "not slow":
+            flags = [*FAST_COMPILATION, os.environ.get("XLA_FLAGS", "")]
+            os.environ["XLA_FLAGS"] = " ".join(flags)
         for name in ("JAX_COMPILATION_CACHE_DIR", "JAXGRAN_NO_CACHE"):
             os.environ.pop(name, None)
         if PROGRAMS not in os.environ:
