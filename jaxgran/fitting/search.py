@@ -135,9 +135,10 @@ def minimise(
         first: the first guess, in the unconstrained scale.
         max_steps: maximum number of steps.
         tolerance: length of a Newton step, in standard errors, at which the search ends.
-        origin: no unknown moves farther from it than `farthest`; by default the first guess.
+        origin: to whose region the unknowns are moved (`nearest`); by default the first guess.
     """
     objective = _Objective(problem, first if origin is None else origin)
+    first = objective.nearest(first)
     if not np.isfinite(objective.value(first)):
         return Minimum(first, np.inf, 0, False)
     if objective.newton_length(first) < tolerance:
@@ -169,10 +170,13 @@ def minimise(
     return Minimum(end, value, int(solution.nit), length < limit)
 
 
-def farthest(problem: Problem) -> Float[np.ndarray, "unknowns"]:
-    """Return how far the unknowns may be from the origin of a search."""
+def nearest(
+    problem: Problem, flat: Float[np.ndarray, "unknowns"], origin: Float[np.ndarray, "unknowns"]
+) -> Float[np.ndarray, "unknowns"]:
+    """Return the nearest unknowns in the region of a search: `MAX_DISTANCE` around its origin."""
     limits = [MAX_DISTANCE.get(u.name, MAX_DISTANCE_OF_OTHERS) for u in problem.unknowns]
-    return np.repeat(limits, [u.size for u in problem.unknowns])
+    farthest = np.repeat(limits, [u.size for u in problem.unknowns])
+    return np.clip(flat, origin - farthest, origin + farthest)
 
 
 @dataclass(frozen=True)
@@ -182,19 +186,15 @@ class _Objective:
     problem: Problem
     origin: Float[np.ndarray, "unknowns"]
 
-    @cached_property
-    def _farthest(self) -> Float[np.ndarray, "unknowns"]:
-        return farthest(self.problem)
-
     def nearest(self, flat: np.ndarray) -> np.ndarray:
-        """Return the nearest unknowns that are not farther from the origin than `farthest`."""
-        return self.origin + np.clip(flat - self.origin, -self._farthest, self._farthest)
+        """Return the nearest unknowns in this region."""
+        return nearest(self.problem, flat, self.origin)
 
     def evaluate(self, flat: np.ndarray) -> Evaluation:
         """Return -2 ln L at the nearest unknowns; it does not depend on those outside."""
         near = self.nearest(flat)
         found = self.problem.evaluate(near)
-        outside = np.abs(flat - self.origin) > self._farthest
+        outside = flat != near
         if not np.any(outside):
             return found
         inside = np.outer(~outside, ~outside)

@@ -209,6 +209,7 @@ def test_the_range_holds_A_where_two_elements_are_not_told(elements, first, seco
     assert both.low[0] < gas.value(A) < both.high[0] and not both.distinguishable
     assert both.improvement >= alone.improvement - 3.84 and in_range(result, gas.value(A))
     assert any(f"{first}, and {second} cannot be excluded" in x for x in result.reasons)
+    assert f"with {first}, in which A = {alone.estimate[0]:.3g} s." in result.verdict
 
 
 @pytest.mark.slow
