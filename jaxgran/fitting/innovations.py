@@ -251,7 +251,7 @@ def _steps(
 ) -> tuple[Array, Array, Array, Array]:
     """Return what happens to the variables from each node's predecessor to it.
 
-    The variables are those of the run (`jaxgran.theory.covariance.process`), followed by the
+    The variables of the run (`jaxgran.theory.covariance.process`) are followed by the
     relative error of theory's cooling rate over its standard deviation, and by the sampling error.
 
     Returns:

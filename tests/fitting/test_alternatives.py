@@ -232,6 +232,26 @@ def test_the_range_has_an_upper_end_where_walls_take_all_energy():
 
 
 @pytest.mark.slow
+def test_ranges_of_parameters_with_two_bounds_are_even_in_their_scale():
+    # A driven gas has no alternatives: its range is that of the law.
+    elements = {"surface": jaxgran.Rough(0.2), "drive": jaxgran.WhiteNoise(1e-2)}
+    gas = dataclasses.replace(glass_beads(0.09), **elements)
+    times = np.geomspace(0.3, 100.0, 20) * float(gas.mean_free_time)
+    exact = jaxgran.cool(gas, times)
+    error = 0.1 * exact.temperature
+    curve = jaxgran.CoolingCurve(times, exact.temperature, temperature_error=error)
+    measurement = jaxgran.Measurement(gas, curve, num_particles=10**6, errors_measured=True)
+    result = jaxgran.fit(measurement, free=("beta_t",))
+    name = "tangential_restitution"
+    free = gas.domains[name].to_free
+    low, high = (float(free(x[0])) for x in result.ranges[name])
+    assert high - low > 1.0
+    # The estimate is within .01 errors, `LAST_STEP`, of the best value; the range is 3.9 errors.
+    middle = pytest.approx(float(free(result.estimate[0])), abs=0.005 * (high - low))
+    assert (low + high) / 2 == middle
+
+
+@pytest.mark.slow
 def test_a_constant_restitution_is_named_and_A_has_no_meaning_then():
     gas = glass_beads(0.1)
     constant = dataclasses.replace(gas, law=jaxgran.ConstantRestitution(0.9))
