@@ -212,7 +212,8 @@ def _pairs(
     found = {}
     for second in kinds_of(problem, base.flat, absent):
         if second.keeps_A:
-            pair = second._replace(
+            pair = replace(
+                second,
                 name=f"{first.name}, and {second.name}",
                 parameters=(*first.parameters, *second.parameters),
             )
@@ -225,14 +226,13 @@ def _with_free_amplitude(
 ) -> tuple[Problem, Trial | None, np.ndarray]:
     """Return the problem with an element whose amplitude is an unknown, its fit, and its origin."""
     name = kind.parameters[0]
-    # A law of impacts is that of drop tests, too; other elements belong to each curve.
-    owners = problem.measurements if kind.changes_law else problem.curves
-    values = {m.label: dict(kind.values(at_best.amplitude, m.label)) for m in owners}
-    first = {m.label: values[m.label].pop(name) for m in owners}
+    values = kind.values_by_label(problem, at_best.amplitude)
+    first = [own.pop(name) for own in values.values()]
     domain = domain_of(problem.curves[0].gas, name)
+    # A law of impacts is that of drop tests, too; other elements belong to each curve.
     labels = [None] if kind.changes_law else [m.label for m in problem.curves]
     unknowns = [Unknown(name, label, (), domain) for label in labels]
-    start = [domain.to_free(x) for x in first.values()][: len(labels)]
+    start = [domain.to_free(x) for x in first[: len(labels)]]
     changed = with_wider_rate_error(problem, kind.rate_error(at_best.amplitude))
     both = replace(changed, unknowns=(*problem.unknowns, *unknowns), fixed=values)
     origin = np.append(law.flat, start)

@@ -1,6 +1,7 @@
 """Kinds of alternative explanations of a measured curve: what is added, and by how much."""
 
 from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -70,130 +71,186 @@ ROUGHNESS_ADDED = "rough grains without initial rotation"
 """Names of alternatives that add one element to the scene."""
 
 
-class Kind(NamedTuple):
+class FittedCurve(NamedTuple):
+    """What the amplitudes of alternatives to a fitted curve are measured by.
+
+    Attributes:
+        scene: the gas of the measurement.
+        rate: cooling rate of the fitted curve at the start, 1/s.
+        lowest: lowest computed T, m^2/s^2.
+    """
+
+    scene: Gas
+    rate: float
+    lowest: float
+
+
+@dataclass(frozen=True, eq=False)
+class Kind:
     """Kind of alternative.
 
     Attributes:
         name: in words.
         parameters: the parameters that it adds; the first one identifies the effect.
         amplitudes: values that are tried, in one or two increasing sequences from 0.
-        values: values of parameters at an amplitude, given the label of the measurement.
+        values: values of parameters at an amplitude, beside a fitted curve; those of a law of
+            impacts do not depend on the curve.
+        applies: whether it is an alternative in a fit whose measurements may have its parameters.
         rate_error: relative error of kinetic theory's cooling rate by it, at an amplitude.
         one_minimum: False if amplitudes beyond excluded ones may be allowed.
         changes_law: whether it is in the law of impacts, which drop tests obey, too.
         keeps_A: False if A has no meaning in it: it is not part of the range.
+        curves: the fitted curves, by label; {} in `KINDS`.
     """
 
     name: str
     parameters: tuple[str, ...]
     amplitudes: tuple[tuple[float, ...], ...]
-    values: Callable[[float, str], dict[str, float]]
+    values: Callable[[float, FittedCurve], dict[str, float]]
+    applies: Callable[[Problem], bool] = lambda problem: True
     rate_error: Callable[[float], float] = lambda amplitude: 0.0
     one_minimum: bool = True
     changes_law: bool = False
     keeps_A: bool = True
+    curves: dict[str, FittedCurve] = field(default_factory=dict)
+
+    def values_by_label(self, problem: Problem, amplitude: float) -> dict[str, dict[str, float]]:
+        """Return the values of parameters in each measurement that it changes."""
+        if not self.changes_law:
+            return {label: self.values(amplitude, x) for label, x in self.curves.items()}
+        any_curve = next(iter(self.curves.values()))
+        return {m.label: self.values(amplitude, any_curve) for m in problem.measurements}
+
+
+def _walls(share: float, curve: FittedCurve) -> dict[str, float]:
+    side = side_of_walls(curve.scene, share * curve.rate)
+    return {"wall_side": side, "wall_coefficient": WALL_RESTITUTION}
+
+
+def _scenes_are_rough(problem: Problem) -> bool:
+    return all("tangential_restitution" in m.scene.domains for m in problem.curves)
+
+
+def _laws_are_viscoelastic(problem: Problem) -> bool:
+    return all("exponent" in m.gas.domains for m in problem.curves)
+
+
+def _varies_A_of_viscoelastic_laws(problem: Problem) -> bool:
+    return _laws_are_viscoelastic(problem) and _varies(problem, "dissipative_constant")
+
+
+def _starts_are_known(problem: Problem) -> bool:
+    return not (_varies(problem, START_TIME) or _varies(problem, "temperature"))
+
+
+def _varies(problem: Problem, name: str) -> bool:
+    return any(u.name == name for u in problem.unknowns)
+
+
+KINDS = (
+    Kind(
+        name=WALLS_ADDED,
+        parameters=("wall_side",),
+        amplitudes=(SHARES,),
+        values=_walls,
+        rate_error=lambda share: WALL_RATE_ERROR * share,
+    ),
+    Kind(
+        name=DRAG_ADDED,
+        parameters=("drag_rate",),
+        amplitudes=(DRAG_SHARES,),
+        values=lambda share, curve: {"drag_rate": share * curve.rate / 2},
+    ),
+    Kind(
+        name="a noise floor in T",
+        parameters=(FLOOR,),
+        amplitudes=(SHARES,),
+        values=lambda share, curve: {FLOOR: share * curve.lowest},
+    ),
+    Kind(
+        name="independent errors of T",
+        parameters=(WHITE,),
+        amplitudes=(WHITE_ERRORS,),
+        values=lambda error, curve: {WHITE: error},
+        applies=lambda problem: not all(np.any(m.errors[:, 0] > 0) for m in problem.curves),
+    ),
+    Kind(
+        name=ROUGHNESS_ADDED,
+        parameters=("tangential_restitution",),
+        amplitudes=(ROUGHNESS,),
+        values=lambda x, curve: {"tangential_restitution": x - 1},
+        rate_error=lambda x: ROUGHNESS_ERROR * min(x, 1.0),
+    ),
+    Kind(
+        name="rough grains that slide",
+        parameters=("tangential_restitution", "friction"),
+        amplitudes=(FRICTION,),
+        values=lambda x, curve: {
+            "tangential_restitution": STICKING_RESTITUTION,
+            "friction": x,
+        },
+        rate_error=lambda x: SLIDING_ERROR * x,
+        one_minimum=False,
+    ),
+    Kind(
+        name="grains that slide",
+        parameters=("friction",),
+        amplitudes=(SLIDING,),
+        values=lambda x, curve: {"friction": 1 / x},
+        applies=_scenes_are_rough,
+        changes_law=True,
+    ),
+    Kind(
+        name="eps that scatters from impact to impact",
+        parameters=("spread",),
+        amplitudes=(SPREADS,),
+        values=lambda x, curve: {"spread": x},
+        applies=_laws_are_viscoelastic,
+        changes_law=True,
+    ),
+    Kind(
+        name="a constant coefficient of restitution",
+        parameters=("exponent",),
+        amplitudes=((1.0,),),
+        values=lambda x, curve: {"exponent": VISCOELASTIC_EXPONENT * (1 - x)},
+        applies=_varies_A_of_viscoelastic_laws,
+        changes_law=True,
+        keeps_A=False,
+    ),
+    Kind(
+        name="an error of the start time or of T_0",
+        parameters=(START_TIME,),
+        amplitudes=(DELAYS, tuple(-x for x in DELAYS)),
+        values=lambda share, curve: {START_TIME: -share / curve.rate},
+        applies=_starts_are_known,
+    ),
+)
+"""All kinds of alternatives: a further explanation is a further row."""
 
 
 def kinds_of(problem: Problem, flat: np.ndarray, absent: tuple[str, ...]) -> list[Kind]:
-    """Return the kinds of alternatives to a fit."""
+    """Return the kinds of alternatives to a fit.
+
+    Args:
+        problem: of the fit.
+        flat: the fitted unknowns, in their unconstrained scale.
+        absent: effects that are known to be absent, see `jaxgran.data.header.ABSENT`.
+    """
     if not problem.curves:
         return []
-    scenes = {m.label: m.scene for m in problem.curves}
-    values = problem.values(flat)
-    curves = problem.evaluate(flat).curves
-    rates = {m.label: _initial_rate(m, values[m.label], curves[m.label]) for m in problem.curves}
-    lowest = {
-        m.label: float(np.min(curves[m.label]["temperature"][m.used[:, 0] > 0]))
-        for m in problem.curves
-    }
-
-    def walls(share: float, label: str) -> dict[str, float]:
-        side = side_of_walls(scenes[label], share * rates[label])
-        return {"wall_side": side, "wall_coefficient": WALL_RESTITUTION}
-
-    beta_t = "tangential_restitution"
-    possible = [
-        Kind(
-            WALLS_ADDED,
-            ("wall_side",),
-            (SHARES,),
-            walls,
-            lambda share: WALL_RATE_ERROR * share,
-        ),
-        Kind(
-            DRAG_ADDED,
-            ("drag_rate",),
-            (DRAG_SHARES,),
-            lambda share, label: {"drag_rate": share * rates[label] / 2},
-        ),
-        Kind(
-            "a noise floor in T", (FLOOR,), (SHARES,), lambda x, label: {FLOOR: x * lowest[label]}
-        ),
-        Kind("independent errors of T", (WHITE,), (WHITE_ERRORS,), lambda x, label: {WHITE: x}),
-        Kind(
-            ROUGHNESS_ADDED,
-            (beta_t,),
-            (ROUGHNESS,),
-            lambda x, label: {beta_t: x - 1},
-            lambda x: ROUGHNESS_ERROR * min(x, 1.0),
-        ),
-        Kind(
-            "rough grains that slide",
-            (beta_t, "friction"),
-            (FRICTION,),
-            lambda x, label: {beta_t: STICKING_RESTITUTION, "friction": x},
-            lambda x: SLIDING_ERROR * x,
-            one_minimum=False,
-        ),
-    ]
-    if all(beta_t in gas.domains for gas in scenes.values()):
-        sliding = Kind(
-            "grains that slide",
-            ("friction",),
-            (SLIDING,),
-            lambda x, label: {"friction": 1 / x},
-            changes_law=True,
-        )
-        possible.append(sliding)
+    curves = _fitted_curves(problem, flat)
     known = {u.name for u in problem.unknowns}
-    if all("exponent" in m.gas.domains for m in problem.curves):
-        spread = Kind(
-            "eps that scatters from impact to impact",
-            ("spread",),
-            (SPREADS,),
-            lambda x, label: {"spread": x},
-            changes_law=True,
-        )
-        constant = Kind(
-            "a constant coefficient of restitution",
-            ("exponent",),
-            ((1.0,),),
-            lambda x, label: {"exponent": VISCOELASTIC_EXPONENT * (1 - x)},
-            changes_law=True,
-            keeps_A=False,
-        )
-        possible.append(spread)
-        if "dissipative_constant" in known:
-            possible.append(constant)
-    if not known & {START_TIME, "temperature"}:
-        delay = Kind(
-            "an error of the start time or of T_0",
-            (START_TIME,),
-            (DELAYS, tuple(-x for x in DELAYS)),
-            lambda share, label: {START_TIME: -share / rates[label]},
-        )
-        possible.append(delay)
-    if all(np.any(m.errors[:, 0] > 0) for m in problem.curves):
-        known.add(WHITE)
     known |= {DECLARABLE[name][0] for name in absent}
-    known |= {name for gas in scenes.values() for name in gas.domains}
-    supported = {FLOOR, WHITE, START_TIME}.union(*(m.gas.domains for m in problem.curves))
-    for m in problem.curves:  # spheres of unequal sizes have neither walls nor roughness
-        supported &= {FLOOR, WHITE, START_TIME, *m.gas.domains}
+    known |= {name for m in problem.curves for name in m.scene.domains}
+    # Spheres of unequal sizes have neither walls nor roughness.
+    supported = {FLOOR, WHITE, START_TIME}
+    supported |= set.intersection(*({*m.gas.domains} for m in problem.curves))
     return [
-        kind
-        for kind in possible
-        if known.isdisjoint(kind.parameters) and supported.issuperset(kind.parameters)
+        replace(kind, curves=curves)
+        for kind in KINDS
+        if known.isdisjoint(kind.parameters)
+        and supported.issuperset(kind.parameters)
+        and kind.applies(problem)
     ]
 
 
@@ -207,6 +264,18 @@ def side_of_walls(gas: Gas, rate: float) -> float:
     flux = 2 * np.sqrt(float(gas.temperature) / (2 * np.pi))
     side = 2 * (1 - WALL_RESTITUTION**2) * flux / max(rate, 1e-300) + float(gas.diameter)
     return max(side, MIN_WALL_SIDE * float(gas.diameter))
+
+
+def _fitted_curves(problem: Problem, flat: np.ndarray) -> dict[str, FittedCurve]:
+    values = problem.values(flat)
+    computed = problem.evaluate(flat).curves
+    curves = {}
+    for m in problem.curves:
+        curve = computed[m.label]
+        rate = _initial_rate(m, values[m.label], curve)
+        lowest = float(np.min(curve["temperature"][m.used[:, 0] > 0]))
+        curves[m.label] = FittedCurve(m.scene, rate, lowest)
+    return curves
 
 
 def _initial_rate(m: CurveRows, values: dict[str, Any], curve: dict[str, Any]) -> float:

@@ -94,11 +94,8 @@ def profile_of(problem: Problem, kind: Kind, base: Trial, origin: np.ndarray) ->
     """
 
     def fit_with(amplitude: float, first: np.ndarray) -> Trial | None:
-        fixed = {
-            m.label: problem.fixed.get(m.label, {}) | kind.values(amplitude, m.label)
-            for m in problem.measurements
-            if kind.changes_law or isinstance(m, CurveRows)
-        }
+        added = kind.values_by_label(problem, amplitude)
+        fixed = {label: problem.fixed.get(label, {}) | own for label, own in added.items()}
         changed = with_wider_rate_error(problem, kind.rate_error(amplitude))
         return trial_of(replace(changed, fixed=fixed), amplitude, first, origin)
 
