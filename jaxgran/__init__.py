@@ -27,7 +27,7 @@ from jaxgran.data.drop_test import DropTest as DropTest
 from jaxgran.data.example import example_measurement as example_measurement
 from jaxgran.data.lammps import lammps_commands as lammps_commands
 from jaxgran.data.measurement import Measurement as Measurement
-from jaxgran.data.measurement import read_measurement as read_measurement
+from jaxgran.data.measurement_file import read_measurement as read_measurement
 from jaxgran.data.particles import read_particles as read_particles
 from jaxgran.data.track_impacts import Impacts as Impacts
 from jaxgran.data.track_impacts import read_impacts as read_impacts

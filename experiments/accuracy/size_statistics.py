@@ -27,7 +27,7 @@ import jaxgran
 from experiments.fit.wrong_physics import LAST, NUM_PARTICLES, PHI, THEORY, beads, two_sizes
 from experiments.support.record import DATA, Options, run_parts
 from experiments.support.scenes import cool
-from jaxgran.fitting.rows import finite_size_cooling_factor
+from jaxgran.fitting.measured_rows import finite_size_cooling_factor
 from jaxgran.theory.sizes import energy_ratio
 
 STORED = DATA / "size_statistics.npz"

@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from jaxgran.data.measurement import Measurement, read_measurement
+from jaxgran.data.measurement import Measurement
+from jaxgran.data.measurement_file import read_measurement
 
 FOLDER = Path(__file__).parent
 

@@ -1,7 +1,5 @@
 """A measurement: what was measured, the gas that it was measured of, and what is known of both."""
 
-import warnings
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -18,21 +16,9 @@ from jaxgran._utils.validation import (
     checked_int,
     float_array,
 )
-from jaxgran.data import files
 from jaxgran.data.curve import QUANTITIES, CoolingCurve
-from jaxgran.data.curve_file import CSV_FILE, OF_ENERGY, read_data
 from jaxgran.data.drop_test import DropTest
-from jaxgran.data.header import (
-    ABSENT,
-    ANY_GAS,
-    absent_of_header,
-    checked_header,
-    gas_of_header,
-    guesses_of_header,
-    header_choice,
-    missing_keys,
-    priors_of_header,
-)
+from jaxgran.data.header import ABSENT
 from jaxgran.scene.gas import Gas
 
 START_TIME = "t0"
@@ -195,94 +181,6 @@ class Measurement(eqx.Module):
             ("known to be absent", ", ".join(self.absent) or "nothing"),
         ]
         return text_table("Measurement", rows)
-
-
-def read_measurement(
-    path: str | Path, header: dict[str, Any] | None = None, *, gas: Gas | None = None
-) -> Measurement:
-    """Read a measured cooling curve or a drop test, with the gas that the header describes.
-
-    A CSV file has header lines ``# key: value``, a line with the names of the columns, and rows of
-    numbers::
-
-        # eta: 0.05
-        # diameter: 2 mm
-        t,T,T_err,msd
-        0.0,1.0e-2,0,0
-        7.8e-3,9.79e-3,8.0e-6,1.7e-6
-
-    Args:
-        path: the file. A CSV file of a curve has the columns t (s) and T (m^2/s^2) and, where
-            measured, T_err (m^2/s^2), T_rot, T_rot_err, msd and msd_err (m^2), in any order. In
-            place of T there may be mean_speed, vx2, v2_xy or energy
-            (`jaxgran.data.curve_file.TEMPERATURE_COLUMNS`), with errors under the same name and
-            _err. A drop test has the columns v (m/s), eps and eps_err; oblique impacts have
-            v_n,v_t (or v,angle), eps, eps_err, eps_t and eps_t_err, or velocities and spins
-            (`jaxgran.data.drop_test_file.drop_test_of_table`). Tracks of particles have the columns
-            id,t,x,y and, where measured, z (`jaxgran.data.tracks.curve_of_tracks`).
-            Units may stand after a name or a value, as in ``t (ms)`` and ``# diameter: 2 mm``;
-            header keys length_unit, time_unit and speed_unit, which holds for T squared, give
-            those of all other columns and of diameter, T0, A and the like; other numbers are in
-            SI. Commas, semicolons, tabs or blanks separate the columns; between semicolons
-            numbers may have decimal commas.
-            Trajectories with velocities (GSD, extended XYZ, LAMMPS dump) and npz files that
-            `write_curve` writes are read, too.
-        header: further entries of the header, before anything is read; they replace
-            entries with the same key. Keys: see `jaxgran.data.header.gas_of_header` and
-            `priors_of_header`, N, replicas, absent, tracked, T0_of ("run" or "ensemble"),
-            T_scale_err, errors ("measured"), which stand for the arguments of `Measurement`, those
-            of drop tests, onto ("sphere", "plate" or "wall"), eps_scatters ("yes") and spin_before
-            ("0"), and those of tracks.
-        gas: the gas in place of the header's, such as the gas of a curve for a drop test.
-
-    Returns:
-        `Measurement`. Unusual values, and columns that contradict the header, cause warnings,
-        which ask a question.
-
-    Raises:
-        ValueError: naming the file, what is wrong, in which line, and what to do.
-
-    >>> known = {"eta": 0.05, "diameter": "2 mm", "density": 2387, "Y": 5e7, "nu": 0.22, "T0": 0.01}
-    >>> jaxgran.write_curve("mine.csv", curve, known, overwrite=True)
-    >>> measurement = jaxgran.read_measurement("mine.csv", {"N": 250})
-    >>> measurement.curve.times.shape, measurement.num_particles
-    ((4,), 250)
-    """
-    path = files.checked_path(path, CSV_FILE)
-    given = {} if header is None else checked_header(header)
-    with files.name_in_errors(path):
-        content = read_data(path, given)
-        entries = content.header
-        questions = content.questions
-        if isinstance(content.data, DropTest) and gas is None:
-            entries = ANY_GAS | entries
-            if missing := missing_keys(entries):
-                raise ValueError(
-                    f"the header of this drop test lacks {', '.join(missing)}: add them, or give "
-                    "the gas of a curve, by gas=... or by jaxgran fit CURVE.csv --drop-test"
-                )
-        if gas is None:
-            gas, more = gas_of_header(entries)
-            questions += more
-        measurement = Measurement(
-            gas,
-            content.data,
-            num_particles=files.header_count(entries, "N"),
-            replicas=files.header_count(entries, "replicas") or 1,
-            priors=priors_of_header(entries),
-            absent=absent_of_header(entries),
-            tracked=files.header_count(entries, "tracked"),
-            ensemble_start=header_choice(entries, "T0_of", ("run", "ensemble")) == "ensemble",
-            calibration_error=files.header_number({"T_scale_err": "0"} | entries, "T_scale_err"),
-            errors_measured=header_choice(entries, "errors", ("any", "measured")) == "measured",
-            of_energy=OF_ENERGY in entries.get("T_from", ""),
-            rounding=content.rounding,
-            guesses=guesses_of_header(entries),
-            header=tuple(entries.items()),
-        )
-    for question in questions:
-        warnings.warn(f"{path}: {question}", stacklevel=2)
-    return measurement
 
 
 def checked_rounding(rounding: Any, data: CoolingCurve | DropTest) -> dict[str, Array]:

@@ -24,9 +24,10 @@ from jaxgran.fitting.information import (
 from jaxgran.fitting.messages import say, with_words
 from jaxgran.fitting.outliers import without_outliers
 from jaxgran.fitting.parameters import as_floats, with_parameters
+from jaxgran.fitting.prediction import TINY
 from jaxgran.fitting.problem import Evaluation, Problem
 from jaxgran.fitting.result import Fit
-from jaxgran.fitting.rows import SCATTER, TINY, CurveRows
+from jaxgran.fitting.rows import SCATTER, CurveRows
 from jaxgran.fitting.search import Descent, Minimum, best_of_starts, minimise
 from jaxgran.fitting.setup import Request, build_problem, problem_with_rate_errors
 from jaxgran.models.checks import describe_walls

@@ -15,6 +15,7 @@ from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import START_TIME, Measurement, Priors
 from jaxgran.fitting.estimate import fit_without_noise
 from jaxgran.fitting.learnt_law import describe_unvisited_knots
+from jaxgran.fitting.measured_rows import unused_displacements, unused_rotation
 from jaxgran.fitting.messages import describe_search
 from jaxgran.fitting.parameters import (
     SHARED,
@@ -24,7 +25,6 @@ from jaxgran.fitting.parameters import (
     with_names_of_law,
 )
 from jaxgran.fitting.result import Fit
-from jaxgran.fitting.rows import unused_displacements, unused_rotation
 from jaxgran.fitting.search import Descent, is_transformation
 from jaxgran.fitting.setup import Request
 from jaxgran.fitting.simulated_fit import fit_through_simulations

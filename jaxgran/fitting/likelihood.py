@@ -14,16 +14,10 @@ from jaxtyping import Array, Float, Int
 from jaxgran.data.curve import DEFAULTS, CoolingCurve
 from jaxgran.data.measurement import Measurement
 from jaxgran.fitting.innovations import Nodes, filtered, log_density_change, log_ratio
+from jaxgran.fitting.measured_rows import curve_rows, with_rate_error
 from jaxgran.fitting.parameters import guess_from_data
-from jaxgran.fitting.rows import (
-    CALIBRATION,
-    ROTATION,
-    CurveRows,
-    Displacement,
-    curve_rows,
-    times_with_nodes,
-    with_rate_error,
-)
+from jaxgran.fitting.prediction import times_with_nodes
+from jaxgran.fitting.rows import CALIBRATION, ROTATION, CurveRows, Displacement
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_model
 from jaxgran.models.kinetic_theory import KineticTheory

@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxgran._utils.tracing import grid_size
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.parameters import as_floats, power_of_line, with_parameters
-from jaxgran.fitting.rows import CALIBRATION, ROTATION, SCATTER, CurveRows, times_with_nodes
+from jaxgran.fitting.rows import CALIBRATION, ROTATION, SCATTER, CurveRows
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.linearise import LinearisedCurve, linearise
 from jaxgran.scene.gas import Gas
@@ -24,6 +25,10 @@ from jaxgran.theory.sizes import energy_ratio, energy_slope
 MAX_LINE_BEFORE = 1.9
 """Largest value of the line ``(T(t)/T(0))^-p`` that is continued before the start, to 2 minus its
 value: at 2 the continued T diverges."""
+
+MAX_LOG_STEP = 0.25
+"""Longest step between two times at which a curve is computed, in ln(1 + t/tau_c): ln T falls by at
+most .4 in a step."""
 
 TINY = float(np.finfo(np.float32).tiny)
 
@@ -336,6 +341,28 @@ def energy_slopes(
     ratio = np.asarray(energy_ratio(spread, size_ratio))
     in_spread = -3 * ((1 - spread**2) / (1 + 3 * spread**2)) ** 2 * np.tanh(size_ratio / 2) / ratio
     return np.log(ratio), in_spread, np.asarray(energy_slope(spread, size_ratio))
+
+
+def times_with_nodes(times: np.ndarray, mean_free_time: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return times from 0 on that contain those given, and the places of these.
+
+    Neighbours are at most `MAX_LOG_STEP` apart in ``ln(1 + t/tau_c)``. They are padded to a length
+    of the grid by repeating the last one.
+    """
+    order = np.argsort(times, kind="stable")
+    known = np.append(0.0, np.log1p(times[order] / mean_free_time))
+    # As many nodes between two times as if the first one were 0: not fewer with another t0.
+    since_first = np.log1p((times[order] - times[order[0]]) / mean_free_time)
+    lengths = np.append(known[1], np.diff(since_first))
+    parts = np.maximum(np.ceil(lengths / MAX_LOG_STEP).astype(int), 1)
+    at = np.cumsum(parts)
+    logs = np.interp(np.arange(at[-1] + 1), np.append(0, at), known)
+    merged = np.expm1(logs) * mean_free_time
+    merged[at] = times[order]
+    place = np.empty(times.size, int)
+    place[order] = at
+    padding = grid_size(merged.size) - merged.size
+    return np.append(merged, np.full(padding, merged[-1])), place
 
 
 def shift_of_nodes(

@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import START_TIME, Measurement, Priors
+from jaxgran.fitting.measured_rows import curve_rows, with_rate_error
 from jaxgran.fitting.parameters import (
     as_floats,
     guess_from_data,
@@ -18,7 +19,7 @@ from jaxgran.fitting.parameters import (
     with_parameters,
 )
 from jaxgran.fitting.problem import Problem
-from jaxgran.fitting.rows import CurveRows, DropRows, curve_rows, with_rate_error
+from jaxgran.fitting.rows import CurveRows, DropRows
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import Gas
 

@@ -28,6 +28,7 @@ from jaxgran.fitting.information import (
     positive,
     undetermined,
 )
+from jaxgran.fitting.measured_rows import curve_rows, with_rate_error
 from jaxgran.fitting.messages import say
 from jaxgran.fitting.parameters import (
     SMOOTHNESS,
@@ -40,7 +41,6 @@ from jaxgran.fitting.parameters import (
 from jaxgran.fitting.prediction import predicted_curve
 from jaxgran.fitting.problem import Problem, summed
 from jaxgran.fitting.result import Fit
-from jaxgran.fitting.rows import curve_rows, with_rate_error
 from jaxgran.fitting.search import Descent, Minimum
 from jaxgran.fitting.setup import (
     Request,

@@ -17,9 +17,10 @@ from jaxgran.fitting.kinds import (
     WALLS_ADDED,
     side_of_walls,
 )
+from jaxgran.fitting.measured_rows import finite_size_cooling_factor
 from jaxgran.fitting.parameters import as_floats, halving_time, with_parameters
+from jaxgran.fitting.prediction import times_with_nodes
 from jaxgran.fitting.result import Fit
-from jaxgran.fitting.rows import finite_size_cooling_factor, times_with_nodes
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.linearise import curve_of_program
 from jaxgran.scene.elements import Rough, StokesDrag, Walls

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.fitting.rows import finite_size_cooling_factor
+from jaxgran.fitting.measured_rows import finite_size_cooling_factor
 from tests.beads import glass_beads
 from tests.fitting.curves import A, deviation, fitted, in_range, rough_beads, synthetic
 

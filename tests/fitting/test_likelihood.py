@@ -10,8 +10,9 @@ import pytest
 import jaxgran
 from jaxgran.fitting.comparison import Comparison
 from jaxgran.fitting.innovations import SAMPLE_MEMORY, Nodes, filtered
+from jaxgran.fitting.measured_rows import curve_rows
 from jaxgran.fitting.prediction import predicted_curve
-from jaxgran.fitting.rows import Noise, curve_rows
+from jaxgran.fitting.rows import Noise
 from jaxgran.fitting.search import minimise
 from jaxgran.fitting.setup import Request, build_problem, problem_with_rate_errors
 from tests.beads import glass_beads

@@ -1,0 +1,280 @@
+"""How a measured curve becomes rows of a fit: values that count, and what makes them scatter."""
+
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from jaxgran._utils.validation import float_array
+from jaxgran.data.curve import NOISE
+from jaxgran.data.measurement import Measurement
+from jaxgran.fitting.prediction import TINY, times_with_nodes
+from jaxgran.fitting.rows import CurveRows, Displacement, Grains
+from jaxgran.models.base import AbstractModel
+from jaxgran.models.choose import error_model_of_curve
+from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.models.linearise import curve_of_program, with_neutral_elements
+from jaxgran.models.scales import scales_at
+from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
+from jaxgran.scene.gas import Gas
+
+WEAK_SCATTER = 1.5
+"""Standard error of ln N where N is not known. Far fewer grains than `UNKNOWN_NUMBER` are a misfit;
+more may be any number."""
+
+UNKNOWN_NUMBER = 1e3
+"""First guess of N where it is not known."""
+
+SCATTER_ERROR = 0.05
+"""Relative error of the variance that theory gives to a run of N grains."""
+
+ERRORS_OF_PARTICLES = 0.1
+"""Relative difference up to which T_err is taken for the fluctuation of independent samples."""
+
+
+def curve_rows(
+    label: str, measurement: Measurement, model: AbstractModel, *, fits_T_0: bool, fits_t0: bool
+) -> tuple[CurveRows, list[str]]:
+    """Return a measured curve as it is compared with a model, and notes on its errors.
+
+    Args:
+        label: of the measurement.
+        measurement: of a curve.
+        model: without noise.
+        fits_T_0: whether T_0 is a free parameter.
+        fits_t0: whether the start of the clock is one; <dr^2>, which starts at t = 0 of the curve,
+            is not used then.
+    """
+    gas = measurement.gas
+    values = _values(measurement)
+    errors, notes = _errors(measurement, values)
+    accuracy = float(model.rotation_accuracy(gas)) if _has_rotation(measurement) else 0.0
+    rows = CurveRows(
+        label=label,
+        measurement=measurement,
+        gas=with_neutral_elements(gas, model),
+        values=values,
+        errors=errors,
+        used=_used(measurement, values, fits_T_0),
+        grains=_grains(measurement, fits_T_0),
+        faster=_finite_size_factor(measurement),
+        unit_time=float(scales_at(gas).mean_free_time),
+        rate_error=(np.zeros(1), np.zeros(1)),
+        rotation_accuracy=accuracy,
+        displacement=None if fits_t0 else _displacement(measurement, model),
+    )
+    return rows, notes
+
+
+def _has_rotation(measurement: Measurement) -> bool:
+    measured = measurement.curve.rotational_temperature
+    return measurement.gas.surface is not None and measured is not None
+
+
+def _values(measurement: Measurement) -> Float[np.ndarray, "times 2"]:
+    """Return the measured T and T_rot, which is 1 where it is not compared."""
+    T = np.asarray(measurement.curve.temperature)
+    T_rot = np.ones_like(T)
+    if _has_rotation(measurement):
+        T_rot = np.asarray(measurement.curve.rotational_temperature)
+    return np.stack([T, T_rot], axis=1)
+
+
+def _errors(
+    measurement: Measurement, values: Float[np.ndarray, "times 2"]
+) -> tuple[Float[np.ndarray, "times 2"], list[str]]:
+    """Return the standard errors of T and T_rot with the rounding of the file, and notes."""
+    dimension = measurement.gas.dimension
+    notes: list[str] = []
+    given = measurement.curve.temperature_error
+    of_T = _errors_of_measurement("T_err", measurement, given, values[:, 0], dimension, notes)
+    given = measurement.curve.rotational_temperature_error if _has_rotation(measurement) else None
+    spins = NUM_SPIN_COMPONENTS[dimension]
+    of_rotation = _errors_of_measurement(
+        "T_rot_err", measurement, given, values[:, 1], spins, notes
+    )
+    digits = measurement.rounding
+    of_T = np.hypot(of_T, np.asarray(digits.get("temperature", 0.0)) / 12**0.5)
+    digit = np.asarray(digits.get("rotational_temperature", 0.0))
+    of_rotation = np.hypot(of_rotation, digit / 12**0.5)
+    return np.stack([of_T, of_rotation], axis=1), notes
+
+
+def _used(
+    measurement: Measurement, values: Float[np.ndarray, "times 2"], fits_T_0: bool
+) -> Float[np.ndarray, "times 2"]:
+    """Return 1 where a value counts, 0 elsewhere.
+
+    A value at t = 0 without an error is the T_0 of the run.
+    """
+    curve = measurement.curve
+    used = np.ones_like(values)
+    used[:, 1] = float(_has_rotation(measurement))
+    if np.asarray(curve.times)[0] == 0 and not _has_error_at_first(measurement):
+        used[0, 0] = float(fits_T_0)
+        used[0, 1] = 0.0
+    error = curve.rotational_temperature_error
+    used[:, 1] *= (values[:, 1] > 0) | (np.asarray(0.0 if error is None else error) > 0)
+    return used
+
+
+def _grains(measurement: Measurement, fits_T_0: bool) -> Grains:
+    N = measurement.num_particles
+    runs = measurement.replicas
+    dimension = measurement.gas.dimension
+    tracked = measurement.tracked
+    sample = 0.0
+    if tracked is not None:
+        left = 1 - (0 if N is None else tracked / N)
+        sample = 2 / (dimension * tracked * runs) * left
+    return Grains(
+        inverse_number=1 / ((UNKNOWN_NUMBER if N is None else N) * runs),
+        log_error=WEAK_SCATTER if N is None else SCATTER_ERROR,
+        sample=sample,
+        first=2 / dimension if measurement.ensemble_start and not fits_T_0 else 0.0,
+    )
+
+
+def _finite_size_factor(measurement: Measurement) -> float:
+    """Return the factor by which the measured gas cools faster because N is small."""
+    N = measurement.num_particles
+    return 1.0 if N is None else float(finite_size_cooling_factor(measurement.gas, float_array(N)))
+
+
+def _has_error_at_first(measurement: Measurement) -> bool:
+    error = measurement.curve.temperature_error
+    counts = measurement.replicas == 1 or measurement.errors_measured
+    return error is not None and counts and float(error[0]) > 0
+
+
+def _errors_of_measurement(
+    name: str,
+    measurement: Measurement,
+    given: Any,
+    values: np.ndarray,
+    components: int,
+    notes: list[str],
+) -> np.ndarray:
+    """Return the standard errors of a measured quantity apart from the fluctuations of N grains.
+
+    The errors of a mean over runs are those of the grains, which the likelihood knows. So are
+    errors of one run that equal ``sqrt(2/(d N))`` of the values, the fluctuation of independent
+    samples of N grains; those of a sample of the grains are computed, too.
+    """
+    nothing = np.zeros_like(values)
+    if given is None:
+        return nothing
+    error = np.asarray(given)
+    if measurement.errors_measured:
+        return error
+    if measurement.replicas > 1:
+        return nothing
+    if measurement.tracked is not None:
+        notes.append(f"{name} is not used: the sampling of {measurement.tracked} grains is known")
+        return nothing
+    N = measurement.num_particles
+    if N is not None:
+        ratio = error[error > 0] / (2 / (components * N)) ** 0.5 / values[error > 0]
+        if ratio.size and np.all(np.abs(ratio - 1) < ERRORS_OF_PARTICLES):
+            notes.append(
+                f"{name} equals the fluctuation of independent samples of {N} grains and is not "
+                "used: the energy of all grains of one run fluctuates less. If these are errors of "
+                "the measurement, say so: `errors: measured`"
+            )
+            return nothing
+    return error
+
+
+def _displacement(measurement: Measurement, model: AbstractModel) -> Displacement | None:
+    """Return <dr^2> if it was measured with errors, or of N grains, and the model knows it.
+
+    ln <dr^2> is compared. If a value is below 0, as after noise was subtracted, only values more
+    than `NOISE` errors above 0 count.
+    """
+    curve = measurement.curve
+    gas = measurement.gas
+    N = measurement.num_particles
+    if curve.displacement is None:
+        return None
+    accuracy = model.displacement_accuracy(gas)
+    if accuracy is None:
+        return None
+    values = np.asarray(curve.displacement)
+    if curve.displacement_error is None:
+        if N is None:
+            return None
+        relative = np.full(values.shape, (2 / (gas.dimension * N * measurement.replicas)) ** 0.5)
+    else:
+        relative = np.asarray(curve.displacement_error) / np.maximum(values, TINY)
+    used = (values > 0) & (relative > 0)
+    if np.any(values < 0):
+        used &= NOISE * relative < 1
+    errors = np.where(used, np.hypot(relative, float(accuracy)), 0.0)
+    return Displacement(values, errors, float(accuracy))
+
+
+def unused_displacements(measurement: Measurement) -> str | None:
+    """Return which <dr^2> of a curve a fit ignores; None unless some of them are below 0."""
+    curve = measurement.curve
+    if curve.displacement is None or curve.displacement_error is None:
+        return None
+    values = np.asarray(curve.displacement)
+    error = np.asarray(curve.displacement_error)
+    if not np.any(values < 0):
+        return None
+    number = int(np.sum((values <= NOISE * error) & (error > 0)))
+    return (
+        f"<dr^2> is below 0 within its error: its logarithm is compared, and {number} of "
+        f"{values.size} values, less than {NOISE:g} errors above 0, are not used"
+    )
+
+
+def unused_rotation(measurement: Measurement) -> str | None:
+    """Return why a fit ignores the T_rot of a curve; None if it uses it or if there is none."""
+    if measurement.curve.rotational_temperature is None or measurement.gas.surface is not None:
+        return None
+    return (
+        "the measured T_rot is not used: the gas has no surface=jaxgran.Rough(...) (header key "
+        "beta_t)"
+    )
+
+
+@eqx.filter_jit
+def finite_size_cooling_factor(gas: Gas, num_particles: ArrayLike) -> Float[Array, ""]:
+    """Factor by which N particles without total momentum cool faster than many, at the same T.
+
+    Their relative velocities are those of the temperature ``T' = T N/(N-1)``, and each particle
+    collides with N - 1 others: with ``-d ln T/dt = r(T)`` the factor is r(T')/r(T), here with the
+    loss ``1 - eps^2`` at the impact speed sqrt(2 T): 1 + .6/N for viscoelastic spheres, 1 + .5/N
+    for a constant eps. It is 1 between walls, which take up momentum.
+    """
+    if gas.container is not None:
+        return jnp.ones_like(gas.temperature)
+    hotter = jnp.sqrt(num_particles / jnp.maximum(num_particles - 1, 1.0))
+    one = jnp.ones_like(gas.temperature)
+    loss = 1 - gas.reduced_law.restitution(one) ** 2
+    ratio = (1 - gas.reduced_law.restitution(hotter * one) ** 2) / jnp.where(loss > 0, loss, 1.0)
+    return hotter * jnp.where(loss > 0, ratio, 1.0)
+
+
+def with_rate_error(rows: CurveRows, model: AbstractModel, gas: Gas) -> CurveRows:
+    """Return a curve with the error of a model's cooling rate in a gas.
+
+    Args:
+        rows: the measured curve.
+        model: of the fit; kinetic theory gives the curve on which the error of a stochastic one
+            depends.
+        gas: the scene, with values of the unknowns.
+    """
+    known = np.asarray(rows.curve.times) * rows.faster
+    times, _ = times_with_nodes(known, rows.unit_time)
+    exact = KineticTheory() if model.stochastic else model
+    curve = curve_of_program(exact, gas, times, rows.displacement is not None)
+    if not np.all(np.isfinite(np.asarray(curve.temperature))):
+        return rows
+    error_model = error_model_of_curve(gas, curve, rows.measurement.num_particles)
+    error = np.broadcast_to(model.rate_error(error_model), times.shape)
+    return replace(rows, rate_error=(times, np.asarray(error, float)))
