@@ -75,9 +75,9 @@ class Comparison:
     def residuals(self, size: int) -> list[Residuals]:
         """Return the residuals, with derivatives in all of `size` unknowns."""
         curve = self.curve
-        rows = [self._of_temperatures(size)]
+        rows = [self._temperature_residuals(size)]
         if curve.rows.displacement is not None:
-            rows.append(_of_displacement(curve, curve.rows.displacement, size))
+            rows.append(_displacement_residuals(curve, curve.rows.displacement, size))
         return rows
 
     def whiten(
@@ -112,10 +112,10 @@ class Comparison:
         values = values / np.sqrt(spread)[..., None]
         return values.swapaxes(0, 1).reshape(-1, count)
 
-    def _of_temperatures(self, size: int) -> Residuals:
+    def _temperature_residuals(self, size: int) -> Residuals:
         """Return the residuals of T, followed by those of T_rot."""
-        moving = _elements_of_temperatures(self.curve)
-        found = self._at_neighbours([tangent for _, tangent in moving])
+        moving = _elements_that_change_temperatures(self.curve)
+        found = self._innovations_at_neighbours([tangent for _, tangent in moving])
         values = found.values
         variances = found.variances
         changes = found.density_changes
@@ -137,7 +137,7 @@ class Comparison:
         label = self.curve.rows.label
         return Residuals("curve", label, whitened, slopes, log_variance, log_slopes)
 
-    def _at_neighbours(self, tangents: list[Prediction]) -> Innovations:
+    def _innovations_at_neighbours(self, tangents: list[Prediction]) -> Innovations:
         """Return innovations at the unknowns, and a step up and a step down along each tangent.
 
         The shapes are (1 + 2 tangents, 2 times): those of T are followed by those of T_rot.
@@ -212,13 +212,13 @@ def _nodes(curve: PredictedCurve, batch: Prediction, gas: Gas) -> Nodes:
     )
 
 
-def _elements_of_temperatures(curve: PredictedCurve) -> list[tuple[Element, Prediction]]:
+def _elements_that_change_temperatures(curve: PredictedCurve) -> list[tuple[Element, Prediction]]:
     """Return the unknowns on which T and T_rot depend, with their tangents."""
     pairs = zip(curve.elements, curve.tangents, strict=True)
     return [(element, tangent) for element, tangent in pairs if element.name != DISPLACEMENT]
 
 
-def _of_displacement(curve: PredictedCurve, measured: Displacement, size: int) -> Residuals:
+def _displacement_residuals(curve: PredictedCurve, measured: Displacement, size: int) -> Residuals:
     """Return the residuals of <dr^2>."""
     collisions = curve.prediction.collisions[curve.place]
     # The common factor is one of D: the ballistic flight before collisions has no error.

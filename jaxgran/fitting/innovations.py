@@ -27,6 +27,12 @@ from jaxgran.theory.covariance import (
 )
 from jaxgran.theory.moments import Spins
 
+LOG_T = 0
+"""Place of ln T among the variables of a run (`jaxgran.theory.covariance`)."""
+
+RATIO = 1
+"""Place of y of rough spheres, or of q of spheres of unequal sizes, among them."""
+
 RATE_ERROR_LENGTH = 1.0
 """Change of ln T over which the error of theory's cooling rate is correlated."""
 
@@ -87,6 +93,26 @@ class Innovations(NamedTuple):
     values: Any
     variances: Any
     density_changes: Any
+
+
+class _Steps(NamedTuple):
+    """What happens to the variables of a run from each node's predecessor to it.
+
+    The variables of the run (`jaxgran.theory.covariance.process`) are followed by the relative
+    error of theory's cooling rate over its standard deviation, and by the sampling error: n
+    variables in all.
+
+    Attributes:
+        start: covariance of the variables of the run at its start, shape (n - 2, n - 2, gases).
+        growth: propagators less 1, shape (nodes, n, n, gases).
+        increments: what is added to the covariance, shape (nodes, n, n, gases).
+        rotation_slope: derivative of ln T_rot in y, 0 for smooth spheres, shape (nodes, gases).
+    """
+
+    start: Any
+    growth: Any
+    increments: Any
+    rotation_slope: Any
 
 
 def log_ratio(values: Array, log_computed: Array, errors: Array) -> Array:
@@ -186,7 +212,7 @@ def filtered(
 
 
 def _run_filter(
-    steps: tuple[Array, Array, Array, Array],
+    steps: _Steps,
     residuals: Float[Array, "nodes 2 columns gases"],
     variances: Float[Array, "nodes 2 gases"],
     sensitivity: Float[Array, "nodes gases"],
@@ -194,14 +220,15 @@ def _run_filter(
     noise: Noise,
     by_size_ratio: Float[Array, "nodes gases"] | None = None,
 ) -> tuple[Float[Array, "nodes 2 columns gases"], Float[Array, "nodes 2 gases"]]:
-    start, changes, increments, of_rotation = steps
+    """Return innovations and variances, see `filtered`."""
     dtype = residuals.dtype
-    lanes = residuals.shape[-1]
-    size = changes.shape[1]
-    rate_error, sample = size - 2, size - 1
-    first = jnp.zeros((size, size, lanes), dtype)
-    first = first.at[: size - 2, : size - 2].set(start)
-    first = first.at[0, 0].add(noise.inverse_number * noise.first)
+    num_gases = residuals.shape[-1]
+    size = steps.growth.shape[1]
+    rate_error = size - 2
+    sample = size - 1
+    first = jnp.zeros((size, size, num_gases), dtype)
+    first = first.at[:rate_error, :rate_error].set(steps.start)
+    first = first.at[LOG_T, LOG_T].add(noise.inverse_number * noise.first)
     first = first.at[rate_error, rate_error].set(1.0)
     first = first.at[sample, sample].set(noise.sample)
     mean = jnp.zeros((size, *residuals.shape[2:]), dtype)
@@ -225,40 +252,41 @@ def _run_filter(
 
     def step(state, at):
         mean, covariance = state
-        change, increment, share, by_rotation, value, variance, is_used, by_size = at
-        mean = mean + jnp.sum(change[:, :, None] * mean[None], axis=1)
-        moved = covariance + product(change, covariance)
-        covariance = moved + product(moved, transposed(change)) + increment
-        # Measured: ln T of the gas with the sampling error, and ln T_rot = ln T + ln(T_rot/T).
-        of_T = share * unit[0] + unit[sample]
-        if by_size is not None:  # T by the energy also depends on q
-            of_T = of_T + share * by_size * unit[1]
-        of_rotation = unit[0] + by_rotation * unit[1]
+        growth, increment, share, rotation_slope, values, errors, is_used, by_size = at
+        mean = mean + jnp.sum(growth[:, :, None] * mean[None], axis=1)
+        moved = covariance + product(growth, covariance)
+        covariance = moved + product(moved, transposed(growth)) + increment
         state = mean, covariance
-        state, of_first, variance_of_first = update(state, of_T, value[0], variance[0], is_used[0])
-        state, of_second, variance_of_second = update(
-            state, of_rotation, value[1], variance[1], is_used[1]
-        )
-        found = jnp.stack([of_first, of_second])
-        return state, (found, jnp.stack([variance_of_first, variance_of_second]))
+        # Measured: ln T of the gas with the sampling error, and ln T_rot = ln T + ln(T_rot/T).
+        of_T = share * unit[LOG_T] + unit[sample]
+        if by_size is not None:  # T by the energy also depends on q
+            of_T = of_T + share * by_size * unit[RATIO]
+        of_rotation = unit[LOG_T] + rotation_slope * unit[RATIO]
+        found = []
+        spread = []
+        for column, weights in enumerate((of_T, of_rotation)):
+            state, innovation, variance = update(
+                state, weights, values[column], errors[column], is_used[column]
+            )
+            found.append(innovation)
+            spread.append(variance)
+        return state, (jnp.stack(found), jnp.stack(spread))
 
-    at = changes, increments, sensitivity, of_rotation, residuals, variances, used, by_size_ratio
-    return jax.lax.scan(step, (mean, first), at)[1]
+    at = (
+        steps.growth,
+        steps.increments,
+        sensitivity,
+        steps.rotation_slope,
+        residuals,
+        variances,
+        used,
+        by_size_ratio,
+    )
+    _, innovations_and_variances = jax.lax.scan(step, (mean, first), at)
+    return innovations_and_variances
 
 
-def _steps(
-    gas: Gas, nodes: Nodes, noise: Noise, differentiable: bool
-) -> tuple[Array, Array, Array, Array]:
-    """Return what happens to the variables from each node's predecessor to it.
-
-    The variables of the run (`jaxgran.theory.covariance.process`) are followed by the
-    relative error of theory's cooling rate over its standard deviation, and by the sampling error.
-
-    Returns:
-        covariance of the run at its start; propagators less 1, and the noise that is added, shape
-        (nodes, n, n, gases); and the derivative of ln T_rot in the second variable, shape (nodes,
-        gases).
-    """
+def _steps(gas: Gas, nodes: Nodes, noise: Noise, differentiable: bool) -> _Steps:
     first = nodes.log_temperature[:1]
     means = Mean(
         nodes.log_temperature - first,
@@ -277,14 +305,14 @@ def _steps(
     drift = drift.at[:rate_error, :rate_error].set(jacobian * collisions)
     # An error of the rate moves all temperatures along their mean course.
     error = _middle(noise.rate_error)[:, None]
-    of_T = _change(nodes.log_temperature)
-    drift = drift.at[0, rate_error].set(error * of_T)
+    change_of_T = _change(nodes.log_temperature)
+    drift = drift.at[LOG_T, rate_error].set(error * change_of_T)
     if gas.surface is not None:
-        of_ratio = _change(jnp.log(nodes.rotation + ROTATION_OFFSET))
-        drift = drift.at[1, rate_error].set(error * of_ratio)
+        change_of_y = _change(jnp.log(nodes.rotation + ROTATION_OFFSET))
+        drift = drift.at[RATIO, rate_error].set(error * change_of_y)
     if nodes.size_ratio is not None:
-        drift = drift.at[1, rate_error].set(error * _change(nodes.size_ratio))
-    memory = jnp.abs(of_T) / RATE_ERROR_LENGTH
+        drift = drift.at[RATIO, rate_error].set(error * _change(nodes.size_ratio))
+    memory = jnp.abs(change_of_T) / RATE_ERROR_LENGTH
     drift = drift.at[rate_error, rate_error].set(-memory)
     noises = noises.at[rate_error, rate_error].set(2 * memory)
     flat = size, size, -1
@@ -293,19 +321,23 @@ def _steps(
         # A step is so short that no variable changes by more than 1/64 of itself.
         longest = jnp.max(jnp.abs(drift))
         needed = jnp.clip(jnp.ceil(jnp.log2(64 * longest)), 1, NUM_DOUBLINGS).astype(int)
-    found = propagators(drift.reshape(flat), noises.reshape(flat), needed)
+    of_run = propagators(drift.reshape(flat), noises.reshape(flat), needed)
+    growth, increments = (_with_one_more_variable(x.reshape(drift.shape)) for x in of_run)
     # The sampling error is independent of all others.
+    sample = size
     forgotten = jnp.expm1(-SAMPLE_MEMORY * collisions)
     sampled = -noise.sample * jnp.expm1(-2 * SAMPLE_MEMORY * collisions)
-    changes, increments = (
-        jnp.moveaxis(jnp.pad(x.reshape(drift.shape), [(0, 1), (0, 1), (0, 0), (0, 0)]), 2, 0)
-        for x in found
-    )
-    changes = changes.at[:, size, size].set(forgotten)
-    increments = increments.at[:, size, size].set(sampled)
+    growth = growth.at[:, sample, sample].set(forgotten)
+    increments = increments.at[:, sample, sample].set(sampled)
     turning = nodes.rotation > 0
-    of_rotation = (nodes.rotation + ROTATION_OFFSET) / jnp.where(turning, nodes.rotation, jnp.inf)
-    return noise.inverse_number * starts[:, :, 0], changes, increments, of_rotation
+    slope = (nodes.rotation + ROTATION_OFFSET) / jnp.where(turning, nodes.rotation, jnp.inf)
+    return _Steps(noise.inverse_number * starts[:, :, 0], growth, increments, slope)
+
+
+def _with_one_more_variable(x: Float[Array, "n n nodes gases"]) -> Array:
+    """Return matrices with one more row and column of 0, shape (nodes, n + 1, n + 1, gases)."""
+    padded = jnp.pad(x, [(0, 1), (0, 1), (0, 0), (0, 0)])
+    return jnp.moveaxis(padded, 2, 0)
 
 
 def _middle(x: Array) -> Array:

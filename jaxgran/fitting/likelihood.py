@@ -83,9 +83,11 @@ def log_likelihood(
         data = _data(measurement, model)
     computed = model.simulate(gas, jnp.asarray(data.times), DEFAULTS)
     nodes = _nodes(gas, data.times, computed, measurement.of_energy)
-    value = _of_temperatures(gas, nodes, data)
+    value = _likelihood_of_temperatures(gas, nodes, data)
     if data.rows.displacement is not None:
-        value = value + _of_displacement(data.rows.displacement, nodes, computed, data.place)
+        value = value + _likelihood_of_displacement(
+            data.rows.displacement, nodes, computed, data.place
+        )
     return jnp.where(jnp.isnan(value), -jnp.inf, value)
 
 
@@ -150,7 +152,7 @@ def _log_measured(gas: Gas, nodes: Nodes, of_energy: bool) -> Float[Array, "node
     return logs
 
 
-def _of_temperatures(gas: Gas, nodes: Nodes, data: _Data) -> Float[Array, ""]:
+def _likelihood_of_temperatures(gas: Gas, nodes: Nodes, data: _Data) -> Float[Array, ""]:
     """Return the logarithm of the likelihood of T and T_rot."""
     rows = data.rows
     observed = jax.tree.map(jnp.asarray, rows.at_nodes(data.times.size, data.place))
@@ -208,7 +210,7 @@ def _without_factors(values: Array, weights: Array, widths: Array) -> Array:
     )
 
 
-def _of_displacement(
+def _likelihood_of_displacement(
     measured: Displacement, nodes: Nodes, computed: CoolingCurve, place: np.ndarray
 ) -> Float[Array, ""]:
     """Return the logarithm of the likelihood of <dr^2>."""
