@@ -70,7 +70,10 @@ def with_parameters(gas: Gas, values: dict[str, Any]) -> Gas:
     positions = structure.unflatten(range(len(leaves)))
     for name, value in values.items():
         leaves[fields[name].get(positions)] = value
-    return structure.unflatten(leaves)
+    changed = structure.unflatten(leaves)
+    # Its parameters have the same places: to find them again takes as long as all else here.
+    vars(changed)["_parameter_fields"] = fields
+    return changed
 
 
 def as_floats(values: dict[str, Any]) -> dict[str, np.ndarray]:

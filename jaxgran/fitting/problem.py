@@ -1,7 +1,6 @@
 """The problem of a fit: measurements, unknowns, and -2 ln L with its derivatives."""
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -25,6 +24,10 @@ from jaxgran.fitting.prediction import Element, PredictedCurve, predicted_curve,
 from jaxgran.fitting.rows import CurveRows, DropRows
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import Gas
+
+MAX_KEPT = 8
+"""Number of evaluations that a problem keeps: that before a rejected step of a search is needed
+again, and so is that of the estimate after the factors of variances have varied."""
 
 
 class Evaluation(NamedTuple):
@@ -60,6 +63,8 @@ class Problem:
     Attributes:
         measurements: curves and drop tests.
         model: computes the curves.
+        simplified_model: the same without what no measurement needs
+            (`jaxgran.models.base.AbstractModel.simplified_for`).
         unknowns: the free parameters, then those that vary because of a prior, then nuisance
             parameters.
         num_free: number of elements of the free parameters.
@@ -70,12 +75,13 @@ class Problem:
 
     measurements: tuple[CurveRows | DropRows, ...]
     model: AbstractModel
+    simplified_model: AbstractModel
     unknowns: tuple[Unknown, ...]
     num_free: int
     priors: dict[str, Priors]
     fixed: dict[str, dict[str, Any]] = field(default_factory=dict)
     tolerance: float = 1.0
-    _last: dict[bytes, Evaluation] = field(init=False, default_factory=dict, compare=False)
+    _evaluations: dict[bytes, Evaluation] = field(init=False, default_factory=dict, compare=False)
     _curves: dict[str, tuple[bytes, PredictedCurve]] = field(
         init=False, default_factory=dict, compare=False
     )
@@ -116,13 +122,10 @@ class Problem:
             unknowns += [unknown(name, label or None, by_label[label]) for name in extra]
         for m in measurements:
             unknowns += [Unknown(name, m.label, (), Domain()) for name in m.nuisances]
-        return cls(measurements, model, tuple(unknowns), num_free, priors)
-
-    @cached_property
-    def _simplified_model(self) -> AbstractModel:
-        displacement = any(m.displacement is not None for m in self.curves)
-        scenes = [m.scene for m in self.measurements]
-        return self.model.simplified_for(*scenes, displacement=displacement)
+        displacement = any(m.displacement is not None for m in curves)
+        scenes = [m.scene for m in measurements]
+        simplified = model.simplified_for(*scenes, displacement=displacement)
+        return cls(measurements, model, simplified, tuple(unknowns), num_free, priors)
 
     @property
     def curves(self) -> tuple[CurveRows, ...]:
@@ -203,10 +206,13 @@ class Problem:
             sources: factors of variances, see `jaxgran.fitting.comparison.Comparison`.
         """
         key = flat.tobytes() + repr(sources).encode()
-        if key not in self._last:
-            self._last.clear()
-            self._last[key] = self._evaluate(flat, sources)
-        return self._last[key]
+        kept = self._evaluations
+        if key not in kept:
+            if len(kept) == MAX_KEPT:
+                oldest = next(iter(kept))
+                del kept[oldest]
+            kept[key] = self._evaluate(flat, sources)
+        return kept[key]
 
     def _evaluate(self, flat: np.ndarray, sources: dict[str, float]) -> Evaluation:
         values = self.values(flat)
@@ -250,7 +256,7 @@ class Problem:
         elements = self.elements(flat)
         for m in self.curves:
             applied = [e for e in elements if e.label in (None, m.label)]
-            model = self._simplified_model
+            model = self.simplified_model
             curve = predicted_curve(
                 m, model, values[m.label], applied, self.tolerance, steady_curve
             )
@@ -263,7 +269,7 @@ class Problem:
         known, curve = self._curves.get(m.label, (b"", None))
         if curve is None or known != flat.tobytes():
             applied = [e for e in elements if e.label in (None, m.label)]
-            curve = predicted_curve(m, self._simplified_model, values, applied, self.tolerance)
+            curve = predicted_curve(m, self.simplified_model, values, applied, self.tolerance)
             self._curves[m.label] = flat.tobytes(), curve
         return curve
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxgran._utils.tracing import as_jax_arrays, fast_jit, grid_size, pad_to
+from jaxgran._utils.tracing import as_jax_arrays, fast_jit, grid_size
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.elements import Rough, StokesDrag, Walls
@@ -103,7 +103,7 @@ def linearise(
         tolerance: factor of the model's tolerance.
     """
     size = times.size
-    padded = pad_to(times, grid_size(size))
+    padded = np.pad(times, (0, grid_size(size) - size), mode="edge")
     sizes = {name: np.size(x) for name, x in gas.parameters.items() if name in names}
     directions, delay = _directions(gas, sizes)
     program = fast_jit(_linearised, jax.default_backend())
