@@ -159,10 +159,8 @@ class Comparison:
         T = np.exp(batch.compared[:, 0])
         compared = batch.compared.copy()
         compared[:, 0] = np.log(T + floor)
-        gas = jax.tree.map(lambda x: np.broadcast_to(x, (gases, *np.shape(x))), curve.gas)
-        gas = with_parameters(
-            gas, {name: np.moveaxis(x, -1, 0) for name, x in batch.parameters.items()}
-        )
+        parameters = {name: np.moveaxis(x, -1, 0) for name, x in batch.parameters.items()}
+        gas = with_parameters(curve.rows.gases(gases), parameters)
         compiled = fast_jit(innovations, jax.default_backend())
         found = compiled(
             gas,

@@ -78,7 +78,8 @@ def with_parameters(gas: Gas, values: dict[str, Any]) -> Gas:
 
 def as_floats(values: dict[str, Any]) -> dict[str, np.ndarray]:
     """Return known values as NumPy arrays of the default float type, by name."""
-    return {name: np.asarray(x, jnp.result_type(float)) for name, x in values.items()}
+    dtype = jnp.result_type(float)
+    return {name: np.asarray(x, dtype) for name, x in values.items()}
 
 
 class Unknown(NamedTuple):

@@ -130,7 +130,12 @@ class _ExpandedCurve:
 
     def value(self, name: str) -> Float[np.ndarray, "nodes"]:
         """Return a field of the curve; 0 for one that it does not have."""
-        return self.linear.values.get(name, np.zeros_like(self.times))
+        return self.linear.values.get(name, self.nothing)
+
+    @cached_property
+    def nothing(self) -> Float[np.ndarray, "nodes"]:
+        """0 at all nodes."""
+        return np.zeros_like(self.times)
 
     @cached_property
     def size_ratio(self) -> Float[np.ndarray, "nodes"] | None:
@@ -143,8 +148,7 @@ class _ExpandedCurve:
     def _energy_slopes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """ln of the measured T over T, and its derivatives in the spread of sizes and in q."""
         if self.size_ratio is None or not self.rows.measurement.of_energy:
-            nothing = np.zeros_like(self.times)
-            return nothing, nothing, nothing
+            return self.nothing, self.nothing, self.nothing
         return energy_slopes(spread_of(self.gas), self.size_ratio)
 
     @cached_property
@@ -179,7 +183,7 @@ class _ExpandedCurve:
         slopes = self._slopes(element)
 
         def change(name: str, over: Any) -> np.ndarray:
-            slope = slopes.get(name, np.zeros_like(self.times))
+            slope = slopes.get(name, self.nothing)
             return slope * element.slope / np.maximum(over, TINY)
 
         def change_of_log(name: str) -> np.ndarray:

@@ -1,8 +1,10 @@
 """Rows of data that a fit compares with a model: those of measured curves and of drop tests."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 import scipy  # which imports scipy.optimize at its first use
 from jaxtyping import Float
@@ -153,6 +155,18 @@ class CurveRows:
     def uses_rotation(self) -> bool:
         """Whether T_rot is compared."""
         return bool(np.any(self.used[:, 1]))
+
+    def gases(self, count: int) -> Gas:
+        """Return the gas `count` times: its floats have a first axis."""
+        if count not in self._known_gases:
+            self._known_gases[count] = jax.tree.map(
+                lambda x: np.broadcast_to(x, (count, *np.shape(x))), self.gas
+            )
+        return self._known_gases[count]
+
+    @cached_property
+    def _known_gases(self) -> dict[int, Gas]:
+        return {}
 
     def at_nodes(self, count: int, place: np.ndarray, error_factor: float = 1.0) -> Observed:
         """Return the measured values among the nodes of a computed curve.

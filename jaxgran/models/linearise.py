@@ -104,7 +104,7 @@ def linearise(
     """
     size = times.size
     padded = np.pad(times, (0, grid_size(size) - size), mode="edge")
-    sizes = {name: np.size(x) for name, x in gas.parameters.items() if name in names}
+    sizes = {name: np.size(gas.value(name)) for name in gas.domains if name in names}
     directions, delay = _directions(gas, sizes)
     program = fast_jit(_linearised, jax.default_backend())
     computed = program(model, gas, padded, np.asarray(tolerance), directions, delay)
