@@ -24,6 +24,9 @@ STALLED_STEP = 0.3
 """The same of a search in which no step lowers -2 ln L: it stalls at a kink, where a measured point
 passes t0."""
 
+NEGLIGIBLE_STEP = 1e-4
+"""Length of a Newton step, in standard errors, that is not taken after the last one."""
+
 MAX_STALLED = 6
 """Number of steps in succession that lower -2 ln L by less than `MIN_FALL_OF_STEP`, after which a
 search ends."""
@@ -162,7 +165,7 @@ def minimise(
     value = objective.value(end)
     limit = max(tolerance, STALLED_STEP if ending.has_stalled else CONVERGED_STEP)
     step, length = newton_step(problem.evaluate(end))
-    if length < CONVERGED_STEP:
+    if NEGLIGIBLE_STEP < length < CONVERGED_STEP:
         further = objective.nearest(end + step)
         if objective.value(further) < value + MIN_FALL_OF_STEP:
             end = further
