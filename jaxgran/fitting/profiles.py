@@ -135,6 +135,8 @@ def profile_of(problem: Problem, kind: Kind, base: Trial, origin: np.ndarray) ->
 
 def with_wider_rate_error(problem: Problem, error: float) -> Problem:
     """Return a problem with a larger error of the cooling rate of its model."""
+    if error == 0:
+        return problem
 
     def widened(m: Any) -> Any:
         if not isinstance(m, CurveRows):
