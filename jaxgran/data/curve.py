@@ -443,6 +443,9 @@ class Run(NamedTuple):
         save: function of the particles of each replica, or "particles". Its value at each time
             becomes `CoolingCurve.saved`. None saves nothing.
         trajectory: file to which the particles are written at each time, or None.
+        starts: equilibrated random starts of earlier runs, which runs of spheres read and extend: a
+            run that finds its gas there takes the positions and draws new velocities. None
+            equilibrates each run.
 
     >>> jaxgran.extend.Run(progress=False).checkpoint is None
     True
@@ -453,6 +456,7 @@ class Run(NamedTuple):
     checkpoint: str | Path | None = None
     save: Callable[..., Any] | str | None = None
     trajectory: str | Path | None = None
+    starts: dict[str, Any] | None = None
 
 
 DEFAULTS = Run()

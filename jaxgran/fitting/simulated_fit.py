@@ -24,8 +24,6 @@ from jaxgran.fitting.estimate import (
 from jaxgran.fitting.goodness import goodness
 from jaxgran.fitting.information import (
     FEW_PARTICLES,
-    SOURCE_STEP,
-    positive,
     undetermined,
 )
 from jaxgran.fitting.measured_rows import curve_rows, with_rate_error
@@ -54,6 +52,7 @@ from jaxgran.fitting.simulations import (
     Simulations,
     by_descent,
     by_gauss_newton,
+    information_by,
 )
 from jaxgran.models.choose import error_model_of_curve
 from jaxgran.models.kinetic_theory import KineticTheory
@@ -218,15 +217,10 @@ def _covariances(
     scale = sims.problem.slopes(average.flat)[:, None]
     to_si = scale * covariance
 
-    def information_with(**sources: float) -> np.ndarray:
-        rows = replace(comparison, sources=sources).whiten(expansion.slopes)
-        return rows.T @ rows / expansion.scatter
-
     parts = {}
-    for name in ("measurement", FEW_PARTICLES, "model", "simulation"):
-        less = information_with(**{name: 1 - SOURCE_STEP})
-        more = information_with(**{name: 1 + SOURCE_STEP})
-        parts[name] = to_si @ positive((less - more) / (2 * SOURCE_STEP)) @ to_si.T
+    for name in ("measurement", FEW_PARTICLES, "model"):
+        by_source = information_by(comparison, expansion.slopes, name) / expansion.scatter
+        parts[name] = to_si @ by_source @ to_si.T
     parts["simulation"] = scale * average.noise * scale.T
     if prior_rows.size:
         parts[SMOOTHNESS] = to_si @ prior_rows.T @ prior_rows @ to_si.T

@@ -8,7 +8,7 @@ an optax transformation each step is one simulation with its gradient in reverse
 estimate is the mean of the last half of the steps (Polyak average).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -19,12 +19,8 @@ from tqdm import tqdm
 
 from jaxgran.data.curve import CoolingCurve, Run
 from jaxgran.fitting.comparison import Comparison
-from jaxgran.fitting.information import (
-    inverse,
-)
-from jaxgran.fitting.parameters import (
-    with_parameters,
-)
+from jaxgran.fitting.information import FEW_PARTICLES, SOURCE_STEP, inverse, positive
+from jaxgran.fitting.parameters import with_parameters
 from jaxgran.fitting.prediction import predicted_curve
 from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.rows import CurveRows
@@ -41,6 +37,11 @@ AVERAGING_DISTANCE = 0.1
 
 MAX_NOISE_SHARE = 0.5
 """Share of the standard error up to which the noise needs no further simulations."""
+
+THEORY_DEGREES = 8
+"""Number of independent replicas that would tell the noise of a simulation as well as kinetic
+theory does. Two or three replicas say little of it, and a search that ends as soon as they say that
+it is small would believe the quiet ones."""
 
 NOISE_WINDOW = 9
 """Number of neighbouring times over which the variance between replicas is averaged."""
@@ -98,12 +99,15 @@ class Simulations:
         theory: the same measurement for kinetic theory, which knows how N grains scatter.
         key: of the random numbers.
         progress: whether to show progress bars.
+        starts: see `jaxgran.data.curve.Run`: elastic spheres in equilibrium know nothing of the
+            law, and their velocities are independent of their positions.
     """
 
     problem: Problem
     theory: CurveRows
     key: PRNGKeyArray
     progress: bool
+    starts: dict[str, Any] = field(default_factory=dict)
 
     @property
     def rows(self) -> CurveRows:
@@ -121,7 +125,7 @@ class Simulations:
 
     def curve_at(self, flat: Any, stream: int) -> CoolingCurve:
         """Return the curve of a simulation; each has another stream of random numbers."""
-        run = Run(jax.random.fold_in(self.key, stream), self.progress)
+        run = Run(jax.random.fold_in(self.key, stream), self.progress, starts=self.starts)
         computed = self.model.simulate(self.gas_at(flat), self.rows.curve.times, run)
         if computed.replicas is None or len(computed.replicas.temperature) < 2:
             raise ValueError(
@@ -197,12 +201,47 @@ class Simulations:
             shift = gain @ columns[:, 1 + p :] / (replicas * (replicas - 1)) ** 0.5
             noises.append(shift @ shift.T)
         sensitivity = comparison.whiten(slopes)
-        return Average(
-            flat=np.mean(estimates, axis=0),
-            information=sensitivity.T @ sensitivity,
-            noise=np.mean(noises, axis=0) / len(near),
-            comparison=comparison,
-        )
+        information = sensitivity.T @ sensitivity
+        noise = np.mean(noises, axis=0)
+        expected = self.expected_noise(comparison, slopes, information, len(near[-1].deviation))
+        if expected is not None:
+            degrees = sum(len(s.deviation) - 1 for s in near)
+            total = THEORY_DEGREES + degrees
+            noise = (THEORY_DEGREES * expected + degrees * noise) / total
+        return Average(np.mean(estimates, axis=0), information, noise / len(near), comparison)
+
+    def expected_noise(
+        self,
+        comparison: Comparison,
+        slopes: Float[np.ndarray, "values p"],
+        information: Float[np.ndarray, "p p"],
+        replicas: int,
+    ) -> Float[np.ndarray, "p p"] | None:
+        """Return the covariance that kinetic theory gives to the estimate of one simulation.
+
+        It is the part of the covariance by the scatter of the measured grains, times their number
+        over the number of simulated ones; None where a model does not know its number.
+        """
+        number = getattr(self.model, "num_particles", None)
+        if number is None:
+            return None
+        covariance = inverse(information)
+        by_grains = covariance @ information_by(comparison, slopes, FEW_PARTICLES) @ covariance
+        return by_grains / (self.theory.grains.inverse_number * number * replicas)
+
+
+def information_by(
+    comparison: Comparison, slopes: Float[np.ndarray, "values p"], source: str
+) -> Float[np.ndarray, "p p"]:
+    """Return the decrease of the information with the logarithm of the variance by one source."""
+
+    def information(factor: float) -> np.ndarray:
+        rows = replace(comparison, sources={source: factor}).whiten(slopes)
+        return rows.T @ rows
+
+    less = information(1 - SOURCE_STEP)
+    more = information(1 + SOURCE_STEP)
+    return positive((less - more) / (2 * SOURCE_STEP))
 
 
 def variance_of_mean(deviation: Float[np.ndarray, "replicas used"]) -> Float[np.ndarray, "used"]:

@@ -81,6 +81,15 @@ class AbstractDynamics(AbstractProcess):
             each, reach: see `jaxgran.particles.run`.
         """
 
+    @property
+    @abstractmethod
+    def equilibrium(self) -> Any:
+        """All that the places of a random start depend on, but for its key."""
+
+    @abstractmethod
+    def with_new_velocities(self, start: Any, key: Any) -> Any:
+        """Return a random start with other velocities."""
+
     @abstractmethod
     def initial(self, start: Any, key: Any, directions: Any) -> Any:
         """Return the state at t = 0.

@@ -271,7 +271,7 @@ def run_on_host(
         )
     if start is None and resumed:  # only its shape counts
         start = _blank_start(dynamics, groups, times.dtype)
-    state = _first_state(loop, start, keys, directions)
+    state = _first_state(loop, start, keys, directions, run.starts)
     observe = partial(over_groups(_observe, groups.devices), recorder)
 
     def empty(x: Array) -> np.ndarray:
@@ -302,12 +302,28 @@ def _blank_start(dynamics: AbstractDynamics, groups: Groups, dtype: Any) -> tupl
     return blank, blank
 
 
-def _first_state(loop: "HostLoop", start: Any, keys: Array, directions: Any) -> Any:
+def _first_state(
+    loop: "HostLoop", start: Any, keys: Array, directions: Any, known: dict[str, Any] | None
+) -> Any:
     """Return the state of all groups at t = 0, of a random start where none is given."""
-    fault = np.zeros(len(loop.groups.rows), np.int32)
+    fault: Any = np.zeros(len(loop.groups.rows), np.int32)
     if start is None:
-        start, fault = loop.dynamics.random_start(keys, loop.each, loop.reach)
+        start, fault = _random_start(loop, keys, known)
     return loop.each(_begin, (loop.dynamics, directions), (start, keys, fault))
+
+
+def _random_start(loop: "HostLoop", keys: Array, known: dict[str, Any] | None) -> tuple[Any, Any]:
+    """Return a random start and its faults: a new one, or a known one with new velocities."""
+    dynamics = loop.dynamics
+    if known is None:
+        return dynamics.random_start(keys, loop.each, loop.reach)
+    described = checkpoint.describe_run(equilibrium=dynamics.equilibrium, groups=len(keys))
+    name = str(described)
+    if name not in known:
+        known[name] = dynamics.random_start(keys, loop.each, loop.reach)
+        return known[name]
+    start, fault = known[name]
+    return loop.each(_with_new_velocities, dynamics, (start, keys)), fault
 
 
 def _record_all(
@@ -356,6 +372,10 @@ def _record_all(
             save(_Reached(num_done, state, records))
             raise
     return _Reached(num_done, state, records)
+
+
+def _with_new_velocities(dynamics: AbstractDynamics, group: tuple[Any, Any]) -> Any:
+    return dynamics.with_new_velocities(*group)
 
 
 def _begin(shared: tuple[AbstractDynamics, Any], group: tuple[Any, Any, Any]) -> Any:

@@ -211,6 +211,17 @@ class AbstractSphereDynamics(AbstractDynamics):
         state = reach([(crowded, settled), (elastic, end)], state)
         return each(_at_rest, self, state)
 
+    @property
+    def equilibrium(self) -> Any:
+        """Elastic spheres of no law, with what equilibrates them."""
+        elastic = self.elastic()
+        return elastic.described()
+
+    def with_new_velocities(self, start: Any, key: PRNGKeyArray) -> Any:
+        """Return a fluid at the same places: in equilibrium velocities do not depend on them."""
+        position, _ = start
+        return position, _first_velocities(key, self.shape)
+
     def placement(self) -> Placement:
         """Return the random placement of the spheres."""
         return Placement(
@@ -342,9 +353,13 @@ def _begin_equilibration(
     """Return the state at the places of a placement, with Maxwellian velocities."""
     placed, key = placed_and_key
     position = placed.position if dynamics.region is None else placed.position + 0.5
-    velocity = maxwellian_velocities(jax.random.split(key)[1], dynamics.shape)
+    velocity = _first_velocities(key, dynamics.shape)
     state = dynamics.initial((position, velocity), key, None)
     return state._replace(status=state.status | placed.status)
+
+
+def _first_velocities(key: PRNGKeyArray, shape: tuple[int, int, int]) -> Float[Array, "n d"]:
+    return maxwellian_velocities(jax.random.split(key)[1], shape)
 
 
 def _at_rest(

@@ -9,6 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran import HardSpheres, SoftSpheres
+from jaxgran.extend import Run
 from tests.beads import curves_of, glass_beads, hard_gas, soft_beads, spheres, without
 
 
@@ -176,3 +177,32 @@ def test_heavily_damped_impacts_end():
     np.testing.assert_allclose(ratio, 1.0, atol=0.005)
     assert hard.temperature[1] < 1e-8 * hard.temperature[0]
     np.testing.assert_allclose(soft.dissipated_energy, hard.dissipated_energy, rtol=1e-3)
+
+
+@pytest.mark.parametrize("model", [HardSpheres(40, replicas=2), SoftSpheres(40, replicas=2)])
+def test_runs_of_one_search_equilibrate_once(model, monkeypatch):
+    """They begin at the same places, with new velocities, whatever A is."""
+    gas = soft_beads(0.2, 0.25, packing_fraction=0.1)
+    times = jnp.zeros(1)
+    kind = type(model.dynamics(model.scene(gas), 3, 2))
+    equilibrations = []
+    random_start = kind.random_start
+
+    def counted(self, *inputs):
+        equilibrations.append(self)
+        return random_start(self, *inputs)
+
+    monkeypatch.setattr(kind, "random_start", counted)
+    starts = {}
+    others = gas.replace(dissipative_constant=2 * gas.dissipative_constant)
+    first = model.simulate(gas, times, Run(jax.random.key(0), starts=starts))
+    second = model.simulate(others, times, Run(jax.random.key(1), starts=starts))
+    assert len(equilibrations) == 1
+    np.testing.assert_array_equal(first.particles.position, second.particles.position)
+    velocity = np.asarray([curve.particles.velocity for curve in (first, second)])
+    assert abs(np.corrcoef(*velocity.reshape(2, -1))[0, 1]) < 0.3
+    np.testing.assert_allclose(second.temperature, gas.temperature)
+    np.testing.assert_allclose(np.mean(velocity, axis=2), 0, atol=1e-12 * np.max(velocity))
+    denser = gas.replace(packing_fraction=0.11)
+    model.simulate(denser, times, Run(jax.random.key(1), starts=starts))
+    assert len(equilibrations) == 2

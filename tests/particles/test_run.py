@@ -52,6 +52,13 @@ class Decaying(AbstractDynamics):
     def random_start(self, key, each, reach):
         return None, jnp.zeros(key.shape, jnp.int32)
 
+    @property
+    def equilibrium(self):
+        return None
+
+    def with_new_velocities(self, start, key):
+        return None
+
     def initial(self, start, key, directions):
         zero = jnp.zeros((), jnp.int32)
         return Decay(jnp.zeros(()), zero, jnp.zeros(5, jnp.int32), jnp.array([1.0, 2.0]), zero)

@@ -180,6 +180,15 @@ class DSMCDynamics(AbstractDynamics):
         """Return no start: velocities are drawn by `initial`."""
         return None, jnp.zeros(key.shape, jnp.int32)
 
+    @property
+    def equilibrium(self) -> None:
+        """None: particles have no places."""
+        return None
+
+    def with_new_velocities(self, start: None, key: PRNGKeyArray) -> None:
+        """Return no start, see `random_start`."""
+        return None
+
     def initial(self, start: Any, key: PRNGKeyArray, directions: Any) -> DSMCState:
         """Return the state at t = 0, with Maxwellian velocities.
 

@@ -117,14 +117,14 @@ class HardDynamics(AbstractSphereDynamics):
     def elastic(self) -> "HardDynamics":
         """Return the dynamics of smooth elastic spheres, between such walls, without drag.
 
-        A drag without effect leaves smooth spheres the program of the run.
+        A drag and a law without effect leave smooth spheres the program of the run.
         """
         material = self.scene.material
         walls = material.walls
         if walls is not None:
             walls = walls._replace(surface=None)
-        drag = jax.tree.map(lambda x: 0 * x, material.drag)
-        material = material._replace(surface=None, walls=walls, drag=drag, drive=None)
+        law, drag = jax.tree.map(lambda x: 0 * x, (material.law, material.drag))
+        material = material._replace(law=law, surface=None, walls=walls, drag=drag, drive=None)
         scene = self.scene._replace(material=material)
         return dataclasses.replace(self, scene=scene, all_elastic=jnp.ones((), bool))
 
