@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from math import hypot
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import numpy as np
@@ -131,6 +131,10 @@ class DSMC(AbstractParticleModel):
     ) -> Callable[..., Result]:
         """Return runs with derivatives in all numbers of a scene; none of them is a frequency."""
         return differentiable(run, material=lambda scene: scene, frequency=lambda scene: None)
+
+    def merged(self, dimension: int, scene: Any, differs: Any, members: int) -> None:
+        """Return no motion: particles of a batch wait for nothing."""
+        return None
 
     def derivative_bias(self, gas: Gas, times: Array, flow_share: Array) -> None:
         """Return None: the gas has no flow."""

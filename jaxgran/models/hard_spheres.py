@@ -24,6 +24,7 @@ from jaxgran.particles.hard.dynamics import (
     HardDynamics,
     allowed_overlap,
 )
+from jaxgran.particles.hard.impacts import LawOfReplicas
 from jaxgran.scene.gas import Gas, SphereScene, reduced_scene, sphere_scene
 from jaxgran.theory.averages import collision_rate
 
@@ -189,6 +190,10 @@ class HardSpheres(AbstractSpheres):
             contact_time=concrete_array(self.contact_time, scene.side.dtype),
             all_elastic=concrete_array(False),
         )
+
+    def laws_of_replicas(self, laws: Any, differs: Any) -> LawOfReplicas:
+        """Return the law of each replica."""
+        return LawOfReplicas(laws)
 
     def refused_derivatives(self, scene: SphereScene) -> dict[str, Any]:
         """Return nothing: derivatives are known in all numbers."""

@@ -18,10 +18,11 @@ from jaxgran.data.curve import DEFAULTS, QUANTITIES, CoolingCurve, Particles, Ru
 from jaxgran.gradients.rule import Result
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel
+from jaxgran.models.members import by_member, together
 from jaxgran.particles import snapshot
 from jaxgran.particles.dynamics import AbstractDynamics
 from jaxgran.particles.elements import transformed_times
-from jaxgran.particles.run import Recorder, grouped, run_on_host, run_traced
+from jaxgran.particles.run import Recorder, grouped, run_on_host, run_traced, start_traced
 from jaxgran.particles.start import has_other_box, reduced_start
 from jaxgran.scene.gas import Gas
 
@@ -82,6 +83,22 @@ class AbstractParticleModel(AbstractModel):
         """
 
     @abstractmethod
+    def merged(
+        self, dimension: int, scene: Any, differs: Any, members: int
+    ) -> AbstractDynamics | None:
+        """Return the motion of members of a batch as replicas in one array, without a start.
+
+        Args:
+            dimension: d.
+            scene: of all members in the units of the run.
+            differs: the same with True at numbers that have a first axis of members.
+            members: number of members.
+
+        Returns:
+            The motion; None if members cannot share an array.
+        """
+
+    @abstractmethod
     def derivative_bias(self, gas: Gas, times: Array, flow_share: Array) -> Array | None:
         """Estimate the bias of the derivatives of ln T from the flow in each replica."""
 
@@ -135,17 +152,50 @@ class AbstractParticleModel(AbstractModel):
             others: key of the random numbers, units of the run, and the times in SI.
             directions: of tangents in the material; None for no tangents.
         """
-        key, units, seconds = others
         save = snapshot.save_function(run.save)
         if any_traced(scene, times, start, others):
             checks.refuse_files(self, run)
-            dynamics = self.dynamics(scene, dimension, self.replicas, traced=True)
-            recorder = Recorder(dynamics, units, save)
-            return run_traced(recorder, times, start, key, directions)
+            traced = partial(self._run_traced, dimension, save)
+            if save is None and start is None and directions is None and self.projected:
+                traced = together(traced, partial(self._run_members, dimension))
+            return traced(scene, (times, start, others, directions))
+        key, units, seconds = others
         groups = grouped(self.replicas, self.num_particles if self.has_positions else 0)
         dynamics = self.dynamics(scene, dimension, self.replicas // groups.number)
         recorder = Recorder(dynamics, units, save)
         return run_on_host(recorder, times, start, key, directions, groups, run, seconds)
+
+    def _run_traced(self, dimension: int, save: Any, scene: Any, others: Any) -> Result:
+        """Return the result of a run of numbers some of which are traced."""
+        times, start, (key, units, _), directions = others
+        dynamics = self.dynamics(scene, dimension, self.replicas, traced=True)
+        recorder = Recorder(dynamics, units, save)
+        return run_traced(recorder, times, start, key, directions)
+
+    def _run_members(
+        self, dimension: int, scene: Any, others: Any, differs: Any, members: int
+    ) -> Result | None:
+        """Return the result of members of a batch in one array; None if they cannot share it.
+
+        They have a common start, as they would have alone, or one for each key.
+        """
+        scene_differs, (times_differ, _, (key_differs, *constants_differ), _) = differs
+        times, _, (key, units, _), _ = others
+        dynamics = self.merged(dimension, scene, scene_differs, members)
+        if dynamics is None or any(jax.tree.leaves((times_differ, constants_differ))):
+            return None
+        first = jax.tree.map(lambda x, has_axis: x[0] if has_axis else x, scene, scene_differs)
+        alone = self.dynamics(first, dimension, self.replicas, traced=True)
+        if key_differs:
+            start, faults = jax.vmap(partial(start_traced, alone))(key)
+            start = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), start)
+            fault = jnp.bitwise_or.reduce(faults)
+            key = key[0]
+        else:
+            start, fault = start_traced(alone, key)
+            start = jax.tree.map(lambda x: jnp.tile(x, (members, 1)), start)
+        result = run_traced(Recorder(dynamics, units, None), times, start, key, None, fault)
+        return by_member(result, members)
 
     @eqx.filter_jit
     def _curve(

@@ -222,6 +222,12 @@ class SoftSpheres(AbstractSpheres):
         material = ReducedScene(ReducedContact.from_law(law, gas), surface, walls)
         return sphere_scene(gas, self.num_particles, material)
 
+    def laws_of_replicas(self, laws: Any, differs: Any) -> Any:
+        """Return the contacts of each replica; None if their stiffness, and so steps, differ."""
+        if differs.alpha:
+            return None
+        return ReducedContact(laws.alpha[0], laws.dissipative_constant, laws.clipped)
+
     def refused_derivatives(self, scene: SphereScene) -> dict[str, Any]:
         """Return numbers of a scene in which the derivative of a run is not known, by a message.
 

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from abc import abstractmethod
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -33,6 +34,11 @@ DIFFERENCE_STEPS = Domain(0.0, 0.5, high_allowed=True)
 S = TypeVar("S", bound="AbstractSpheres")
 
 
+MEMBERS = 8
+"""Number of members of a batch for which the lengths of arrays are computed: more members get a
+multiple of them."""
+
+
 class ArraySizes(NamedTuple):
     """Static sizes of the arrays of a compiled run.
 
@@ -42,6 +48,7 @@ class ArraySizes(NamedTuple):
         capacity: sizes of the arrays of the run.
         equilibration_capacity: sizes of the arrays in the first mean free times of equilibration.
         engine: search for pairs in compiled code, for which `lookahead` of the sizes is made.
+        of_batch: sizes for `MEMBERS` such gases in one array; None for known numbers.
     """
 
     made_for: tuple[tuple[str, Any], ...]
@@ -49,6 +56,7 @@ class ArraySizes(NamedTuple):
     capacity: Capacity
     equilibration_capacity: Capacity
     engine: str
+    of_batch: "ArraySizes | None" = None
 
 
 class AbstractSpheres(AbstractParticleModel):
@@ -146,7 +154,9 @@ class AbstractSpheres(AbstractParticleModel):
         """
         checked_float("spare", spare, POSITIVE, "2 is twice the expected need.")
         self.check_scene(checks.checked_gas(gas))
-        sizes = self.needed_sizes(self.scene(gas), gas.dimension, self.replicas, spare)
+        needed = partial(self.needed_sizes, self.scene(gas), gas.dimension)
+        of_batch = needed(MEMBERS * self.replicas, spare)
+        sizes = needed(self.replicas, spare)._replace(of_batch=of_batch)
         return dataclasses.replace(self, _sizes=sizes)
 
     def units(self, gas: Gas) -> Units:
@@ -181,6 +191,47 @@ class AbstractSpheres(AbstractParticleModel):
                 "its cells from known numbers: leave neighbours out"
             )
         return self.motion(scene, (replicas, self.num_particles, dimension), sizes, engine)
+
+    @abstractmethod
+    def laws_of_replicas(self, laws: Any, differs: Any) -> Any:
+        """Return the law of the impacts of replicas that have different ones.
+
+        Args:
+            laws: law whose numbers have a first axis of replicas.
+            differs: the same law with True at numbers that differ.
+
+        Returns:
+            The law; None if replicas with different numbers cannot share an array.
+        """
+
+    def merged(
+        self, dimension: int, scene: SphereScene, differs: SphereScene, members: int
+    ) -> AbstractSphereDynamics | None:
+        """Return the motion of members that differ in their law alone; None for all others."""
+        material = differs.material._replace(law=None)
+        others = differs._replace(material=material, contact_duration=False)
+        if self._sizes is None or self._sizes.of_batch is None or any(jax.tree.leaves(others)):
+            return None
+        sizes = self._sizes.of_batch
+        count = members * self.replicas
+
+        def of_replicas(x: Array, is_batched: bool) -> Array:
+            if is_batched:
+                return jnp.repeat(x, self.replicas, axis=0)
+            return jnp.broadcast_to(x, (count, *jnp.shape(x)))
+
+        laws = jax.tree.map(of_replicas, scene.material.law, differs.material.law)
+        law = self.laws_of_replicas(laws, differs.material.law)
+        if law is None:
+            return None
+        together = scene._replace(
+            contact_duration=jnp.min(scene.contact_duration),
+            material=scene.material._replace(law=law),
+        )
+        arrays = -(-members // MEMBERS)
+        longer = sizes._replace(capacity=sizes.capacity.of_members(arrays))
+        engine = choose_engine(self.neighbours, sizes.engine, True)
+        return self.motion(together, (count, self.num_particles, dimension), longer, engine)
 
     def _known_sizes(self, scene: SphereScene, dimension: int, replicas: int) -> ArraySizes:
         """Return the sizes of the model, or new ones if all numbers that they need are known.

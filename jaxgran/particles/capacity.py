@@ -73,6 +73,11 @@ class Capacity(NamedTuple):
         in_list = status.flag(status.LIST_FULL, jnp.any(full[:2]))
         return in_list | status.flag(status.CONTACTS_FULL, jnp.any(full[2:]))
 
+    def of_members(self, members: int) -> "Capacity":
+        """Return a capacity for several such gases in one array."""
+        rows = (members * x for x in self)
+        return Capacity(*rows)._replace(lookahead=self.lookahead)
+
     def grown(self, needed: Sequence[int]) -> "Capacity":
         """Return a capacity with more rows wherever more are needed than there are."""
         pairs = zip(self, needed, strict=True)

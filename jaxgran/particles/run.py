@@ -118,6 +118,30 @@ def begun(dynamics: AbstractDynamics, start: Any, key: Any, fault: Any, directio
     return state._replace(status=state.status | fault)
 
 
+def _move(process: AbstractProcess, state: Any, until: Array) -> Any:
+    return jax.lax.while_loop(
+        lambda state: process.unfinished(state, until),
+        lambda state: process.advance(state, until),
+        state,
+    )
+
+
+@eqx.filter_jit
+def start_traced(dynamics: AbstractDynamics, key: PRNGKeyArray) -> tuple[Any, Any]:
+    """Return a random start and its faults inside JAX transformations."""
+
+    def reach(stages: Stages, state: Any) -> Any:
+        """Move a state by the first process, whose arrays suffice for all stages."""
+        process, _ = stages[0]
+        ends = jnp.stack([jnp.asarray(until) for _, until in stages])
+        reached, _ = jax.lax.scan(
+            lambda state, until: (_move(process, state, until), None), state, ends
+        )
+        return reached
+
+    return dynamics.random_start(key, lambda call, *inputs: call(*inputs), reach)
+
+
 @eqx.filter_jit
 def run_traced(
     recorder: Recorder,
@@ -125,40 +149,24 @@ def run_traced(
     start: Any,
     key: PRNGKeyArray,
     directions: Any,
+    fault: Any = status.OK,
 ) -> Result:
     """Return the result of a run inside JAX transformations.
 
     Args:
         recorder: with the dynamics of all replicas in one array.
         times: of the records.
-        start: positions and velocities given by the user; None for random ones.
+        start: positions and velocities; None for random ones.
         key: of the random numbers.
         directions: of tangents in the material; None for no tangents.
+        fault: of the start.
     """
     dynamics = recorder.dynamics
-
-    def move(process: AbstractProcess, state: Any, until: Array) -> Any:
-        return jax.lax.while_loop(
-            lambda state: process.unfinished(state, until),
-            lambda state: process.advance(state, until),
-            state,
-        )
-
-    def reach(stages: Stages, state: Any) -> Any:
-        """Move a state by the first process, whose arrays suffice for all stages."""
-        process, _ = stages[0]
-        ends = jnp.stack([jnp.asarray(until) for _, until in stages])
-        reached, _ = jax.lax.scan(
-            lambda state, until: (move(process, state, until), None), state, ends
-        )
-        return reached
-
-    fault = jnp.zeros((), jnp.int32)
     if start is None:
-        start, fault = dynamics.random_start(key, lambda call, *inputs: call(*inputs), reach)
+        start, fault = start_traced(dynamics, key)
 
     def record_at(state: Any, until: Array) -> tuple[Any, Records]:
-        state = move(dynamics, state, until)
+        state = _move(dynamics, state, until)
         return state, recorder(state)
 
     state = begun(dynamics, start, key, fault, directions)
@@ -391,7 +399,7 @@ def _to_lab_frame(dynamics: AbstractDynamics, state: Any) -> Any:
     return dynamics.to_lab_frame(state)
 
 
-def _move(shared: tuple[AbstractProcess, Any], state: Any) -> tuple[Any, Array]:
+def _advance(shared: tuple[AbstractProcess, Any], state: Any) -> tuple[Any, Array]:
     process, until = shared
     state = process.advance(state, until)
     return state, process.unfinished(state, until)
@@ -448,7 +456,7 @@ class HostLoop:
         if process.calls_host:
             shared = lengthened, until
             each = [
-                _move(shared, jax.tree.map(lambda x, k=k: x[k], state))
+                _advance(shared, jax.tree.map(lambda x, k=k: x[k], state))
                 for k in range(len(state.time))
             ]
             moved = jax.tree.map(lambda *x: jnp.stack(x), *each)
@@ -456,7 +464,7 @@ class HostLoop:
             # No other part of the run has such a program: it runs for a short time.
             kind = type(process), capacity
             short = kind != (type(self.dynamics), self.dynamics.capacity)
-            program = over_groups(_move, self.groups.devices, short)
+            program = over_groups(_advance, self.groups.devices, short)
             with compiling(described_program(lengthened, state), self.progress):
                 moved = program((lengthened, until), state)
         state, busy = block_until_ready(moved)

@@ -22,6 +22,24 @@ from jaxgran.particles.hard.prediction import ImpactCandidates, Paths, first_imp
 from jaxgran.particles.spheres import SphereState, temperature
 from jaxgran.scene.elements import wall_impact_ratio
 from jaxgran.scene.gas import ReducedScene, SphereScene
+from jaxgran.scene.laws import ReducedLaw
+
+
+class LawOfReplicas(ReducedLaw):
+    """Another law in each replica, or in each row.
+
+    Attributes:
+        laws: its numbers have a first axis of replicas, or of rows.
+    """
+
+    laws: ReducedLaw
+
+    def of_rows(self, replica: Int[Array, "rows"]) -> "LawOfReplicas":
+        """Return the laws of the replicas to which some rows belong."""
+        return LawOfReplicas(jax.tree.map(lambda x: x.at[replica].get(mode="clip"), self.laws))
+
+    def restitution(self, normal_speed: Float[Array, "rows"]) -> Float[Array, "rows"]:
+        return jax.vmap(lambda law, speed: law.restitution(speed))(self.laws, normal_speed)
 
 
 class ImpactEvents(NamedTuple):
@@ -235,6 +253,10 @@ def execute_impacts(
     a = rows.a
     b = rows.b
     num_rows = len(rows.a)
+    law = scene.material.law
+    if isinstance(law, LawOfReplicas):
+        law = law.of_rows(candidates.replica[a])
+        scene = scene._replace(material=scene.material._replace(law=law))
     index = jnp.arange(num_rows, dtype=jnp.int32)
 
     def one_round(work: ImpactWork) -> ImpactWork:

@@ -208,8 +208,9 @@ class SoftDynamics(AbstractSphereDynamics):
         material = self.scene.material
         xi, _, touching = overlap(x, pairs.i, pairs.j, pairs.offset)
         touching &= jnp.arange(len(xi), dtype=jnp.int32) < pairs.count
-        stored = elastic_energy(jnp.where(touching, xi, 0.0), material.law, PAIR)
         replica = pairs.i // (len(x) // self.replicas)
+        law = _of_rows(material.law, replica)
+        stored = elastic_energy(jnp.where(touching, xi, 0.0), law, PAIR)
         elastic = jnp.zeros_like(state.internal.elastic).at[replica].add(stored)
         if self.scene.container is not None:
             depth = wall_overlap(self.scene.container, x)[0]
