@@ -36,7 +36,7 @@ COLOURS = {
     "viscoelastic": "#009e73",
 }
 """Colours of all pictures by meaning: measurements (in an experiment, in LAMMPS, by finite
-differences), guides to the eye, models by their names, kinds of gases. The palette is that of M.
+differences), guides to the eye, models by their names, kinds of gases. The palette is by M.
 Okabe and K. Ito, Color Universal Design (2008), which colour-blind people can distinguish; lines
 and points also differ in style, for pictures in grey."""
 

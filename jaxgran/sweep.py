@@ -114,7 +114,7 @@ def sweep(
             group is the store of the same sweep, only missing chunks are computed. Needs the extra
             `sweep`, and a file system that all processes share. None keeps the results in memory
             only.
-        chunk: number of members computed and written together, >= 1; by default that of an existing
+        chunk: number of members computed and written together, >= 1; by default as in an existing
             store, otherwise 16 for a stochastic model and 1024 for others.
         progress: show a progress bar on a terminal.
 

@@ -212,8 +212,8 @@ def choose(
 
     Args:
         scene: TOML file with eta, diameter, density, Y, nu, T0 and A (SI), and N for a gas in a
-            box, or the CSV file of a curve with these keys in its header. Without A that of a fit
-            of the curve is used.
+            box, or the CSV file of a curve with these keys in its header. If the header has no A,
+            A is fitted to the curve.
         until: Last time, s; needed for a TOML file, by default the last time of the CSV file.
         tolerance: Allowed relative error of T.
         no_cache: Disable the compilation cache (same as JAXGRAN_NO_CACHE=1).

@@ -62,7 +62,7 @@ QUANTITIES = {
         *(part for measured in WITH_ERRORS for part in (measured, measured.error)),
         Quantity("sonine", "a2", "1", "second Sonine coefficient"),
         Quantity("third_sonine", "a3", "1", "third Sonine coefficient"),
-        Quantity("size_ratio", "size_ratio", "1", "<v^2> of small over that of large spheres"),
+        Quantity("size_ratio", "size_ratio", "1", "<v^2> of small over <v^2> of large spheres"),
         Quantity("collisions", "collisions", "1", "collisions per particle since t = 0"),
         Quantity("diffusion", "D", "m^2/s", "self-diffusion coefficient"),
         Quantity("velocity_correlation", "velocity_correlation", "m^2/s^2", "<v(0) . v(t)>/d"),
@@ -499,8 +499,8 @@ _PARTICLES = {
 def to_arrays(curve: CoolingCurve) -> dict[str, Any]:
     """Return the arrays of a curve by name: `from_arrays` is the inverse.
 
-    A quantity has the name of its field, and that of the replicas ends in _of_replicas. The final
-    particles have the names of their fields. A saved array is named by its place in the tree:
+    A quantity has the name of its field; its values by replica have the suffix _of_replicas. The
+    final particles have the names of their fields. A saved array is named by its place in the tree:
     ``saved.S.0`` the mean, ``saved_error.S.0`` its standard error, ``saved_of_replicas.S.0`` the
     values of each replica.
 

@@ -63,8 +63,8 @@ class DropTest(eqx.Module):
         of_centres: whether tangential_restitution is the ratio of velocities of the centre, of
             spheres that do not rotate before the impact.
         speed_error: standard error of each speed, m/s, shape (n,), >= 0, where eps is the ratio of
-            two measured speeds; `error` is then that of the speed after over the speed before.
-            None if the speeds are known.
+            two measured speeds; `error` is then the error of the speed after the impact, over the
+            speed before it. None if the speeds are known.
         correlation: of the errors of the speeds before and after, shape (n,), in [-1, 1]; None
             for 0.
         scatters: whether eps scatters from impact to impact by more than its error, as rough

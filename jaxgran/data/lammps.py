@@ -21,8 +21,8 @@ def lammps_commands(gas: Gas, diameters: Sequence[float] | None = None) -> str:
     The normal force is ``F = k sqrt(R_eff) xi^(3/2) + (3/2) A k sqrt(R_eff xi) dxi/dt`` with
     ``k = 2 Y/(3 (1 - nu^2))`` and ``1/R_eff = 1/R_i + 1/R_j``: ``hertz k eta`` with ``damping
     viscoelastic``, whose damping is ``eta m_eff sqrt(R_eff xi)``. So ``eta = (3/2) A k/m_eff``
-    contains the effective mass of a pair, ``m_i m_j/(m_i + m_j)``, and that of a sphere at a wall,
-    m_i; each pair of sizes has a line of its own. With ``limit_damping`` the force never attracts:
+    depends on the effective mass, ``m_i m_j/(m_i + m_j)`` of a pair and m_i of a sphere at a wall:
+    each pair of sizes has a line of its own. With ``limit_damping`` the force never attracts:
     a contact ends where it vanishes, before the spheres part, as in jaxgran.
 
     Args:

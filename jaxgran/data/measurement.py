@@ -64,14 +64,14 @@ class Measurement(eqx.Module):
             a fit does not consider them as explanations of the curve.
         tracked: number of grains of each run that T is the mean of, if it is less than N: T then
             has a sampling error in addition. None if T is the mean over all grains.
-        ensemble_start: True if T_0 of the gas is that of an ensemble from which the velocities were
-            drawn; False if it is that of the run itself.
+        ensemble_start: True if T_0 of the gas is the temperature of an ensemble from which the
+            initial velocities were drawn; False if it is the temperature of this run at its start.
         calibration_error: relative standard error of the scale of T, common to all times.
         errors_measured: True if the errors of the data are errors of measurement. Errors of T of
             one run that equal ``sqrt(2/(d N)) T`` are otherwise taken for the fluctuation of
             independent samples and left out, since the fluctuations of N grains are known.
-        of_energy: True if T is that by the mean energy over the mean mass, ``<m v^2>/(d <m>)``, and
-            not ``<v^2>/d``: of spheres of unequal sizes they differ.
+        of_energy: True if T is the mean energy over the mean mass, ``<m v^2>/(d <m>)``, and not
+            ``<v^2>/d``: the two differ for spheres of unequal sizes.
         rounding: last digit of a field of the curve as it was written, SI, one number or one for
             each time, as ``{"temperature": 1e-6}``; {} if all are exact.
         guesses: parameters of the gas whose values are guesses, which a fit must estimate.

@@ -2,7 +2,7 @@
 written frame by frame during a run, as GSD or extended XYZ.
 
 GSD files are read and written by `gsd`. Text files are read here: ASE 3.29, which reads them too,
-changes the last digit of a tenth of the numbers of a dump and of half of those of a data file,
+changes the last digit of 10 % of the numbers of a dump and of 50 % of the numbers of a data file,
 leaves out angular velocities, units and times, accepts chemical elements alone as species, and
 writes XYZ with 8 decimals.
 """
@@ -370,7 +370,7 @@ def _read_xyz(lines: list[str], dimension: int | None) -> Frame:
     for name, number in zip(parts[::3], map(int, parts[2::3]), strict=True):
         name = name.lower() if name.lower() in XYZ_VECTORS else name
         several = XYZ_VECTORS.get(name, [f"{name}_{k}" for k in range(number)])
-        # In a plane the only component of the angular velocity is that of z.
+        # In a plane the angular velocity has a z component only.
         names += [name] if number == 1 and name not in XYZ_VECTORS else several[-number:]
     if dimension is None and "dimension" in info:
         dimension = int(info["dimension"])

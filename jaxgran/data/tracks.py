@@ -147,10 +147,10 @@ def curve_of_tracks(
     coordinates. In a gas of N particles (header key N) without walls, whose true momentum is 0, T
     is multiplied by ``(N - 1)/N``. Two coordinates of a three-dimensional gas represent all three.
 
-    Displacements of wrong identities are left out: those that fewer than `CHANCE` gases with
-    Maxwellian velocities would show, and those of two particles whose displacements are more
-    probable, by `MIN_GAIN` in chi^2, with their identities exchanged. T by the median of the speeds
-    is compared with T by their mean square.
+    Displacements of wrong identities are left out. They are of two kinds: displacements so long
+    that fewer than `CHANCE` gases with Maxwellian velocities would show them, and displacements of
+    two particles that are more probable, by `MIN_GAIN` in chi^2, if the two exchange their
+    identities. T by the median of the speeds is compared with T by their mean square.
 
     Two biases of u^2 are removed if the header gives the necessary values. The standard error of
     one coordinate of a position, ``localisation_error``, adds ``2 error^2/(t_2 - t_1)^2`` to T; the
@@ -164,8 +164,8 @@ def curve_of_tracks(
     correlated, as the particles are the same.
 
     Args:
-        columns: those of `track_columns`, in SI; rows in any order. Positions continue when a
-            particle leaves a periodic box, unless the header gives ``box_side``.
+        columns: the columns that `track_columns` names, in SI; rows in any order. Positions
+            continue when a particle leaves a periodic box, unless the header gives ``box_side``.
         header: in SI; with ``frame_rate``, frames per second, for frames without times. It is
             changed: T_from says how T was computed, and the keys of tracks are removed.
         lines: line number of each row.
@@ -527,7 +527,7 @@ def curve_of_trajectory(
 
     ``T = sum (v - <v>)^2 / (d N)`` in periodic boxes, and ``<v^2>/d`` between walls, which are at
     rest. With angular velocities w and a diameter ``T_rot = q sigma^2 <w^2>/(4 d_rot)``, where q is
-    the header key reduced_inertia, by default 0.4. The standard errors are those of N independent
+    the header key reduced_inertia, by default 0.4. The standard errors are for N independent
     particles.
 
     Args:

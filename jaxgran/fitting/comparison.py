@@ -130,7 +130,7 @@ class Comparison:
             of_log_variance = np.log(variances[up] / variances[down]) / (2 * DIFFERENCE)
             of_change = (changes[up] - changes[down]) / (2 * DIFFERENCE)
             # What -2 ln L gains where T is compared in place of ln T is shared between both, so
-            # that slopes become those of (y - T)/error there, and log_slopes 0.
+            # that slopes become the slopes of (y - T)/error there, and log_slopes 0.
             slopes[:, element.place] = of_value / error + 0.5 * whitened * of_change
             log_slopes[:, element.place] = of_log_variance + of_change
         log_variance = np.log(variances[0]) + changes[0]
@@ -140,7 +140,7 @@ class Comparison:
     def _innovations_at_neighbours(self, tangents: list[Prediction]) -> Innovations:
         """Return innovations at the unknowns, and a step up and a step down along each tangent.
 
-        The shapes are (1 + 2 tangents, 2 times): those of T are followed by those of T_rot.
+        The shapes are (1 + 2 tangents, 2 times): all times of T, then all times of T_rot.
         """
         curve = self.curve
         count = 1 + 2 * len(tangents)

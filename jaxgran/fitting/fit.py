@@ -77,7 +77,7 @@ def fit(
             material.
         model: a `jaxgran.extend.AbstractModel`, by default `jaxgran.KineticTheory()`; a stochastic
             model needs two or more replicas.
-        free: names of the free parameters: those of the gas or its law, such as "temperature"
+        free: names of the free parameters: numbers of the gas or its law, such as "temperature"
             (T_0), or their symbols in files, such as "T0"; or "t0", the time at which the gas had
             T_0 and began to cool, if the clock was not started then; "law" stands for all numbers
             and arrays of the law. A single name needs no tuple. By default A (or a constant
@@ -91,7 +91,7 @@ def fit(
             at that from the data, whichever fits better; a stochastic model starts at this one.
         solver: a gradient transformation of optax, such as ``optax.adam(0.05)``, for laws of many
             parameters: each step takes one gradient of -2 ln L in the unconstrained scale, through
-            a stochastic model that of one simulation with new random numbers, and the estimate is
+            a stochastic model from one simulation with new random numbers, and the estimate is
             then the mean of the last half of the steps. Its course is ``result.trace``. With more
             than 30 parameters and a stochastic model the errors are nan.
         max_steps: maximum number of steps, >= 1, by default 100 (of optax, 1000), or of simulations

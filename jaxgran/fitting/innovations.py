@@ -53,7 +53,7 @@ SMALLEST_VARIANCE = 1e-12
 
 
 class Nodes(NamedTuple):
-    """Curves of some neighbouring gases at times that begin at 0 and include those of the data.
+    """Curves of some neighbouring gases at times from 0 on that include the times of the data.
 
     Arrays have the shape (nodes, gases): operations on small matrices are fast where the last axis
     is long.
@@ -136,8 +136,8 @@ def log_density_change(values: Array, log_computed: Array, errors: Array) -> Arr
     """Return what -2 ln L gains as `log_ratio` is not everywhere ln of the measured value.
 
     It is ``-2 ln(y df/dy)`` for the residual f of a value y, 0 where f is ln y: the density of y is
-    that of f times df/dy. Where y is below its error, the error replaces the first y, which no
-    parameter changes.
+    the density of f times df/dy. Where y is below its error, the error replaces the first y, which
+    no parameter changes.
     """
     ratio = values / jnp.exp(log_computed)
     share = _share_of_log(log_computed, errors)

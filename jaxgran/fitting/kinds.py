@@ -31,7 +31,7 @@ FRICTION = (0.02, 0.04, 0.06, 0.15, 0.4, 1.0)
 """Values of mu of smooth spheres that become rough and slide."""
 
 STICKING_RESTITUTION = 0.44
-"""beta_t of these, where they stick: that of glass (.44) and acetate (.43) beads, Foerster et al.,
+"""beta_t of these, where they stick: as for glass (.44) and acetate (.43) beads, Foerster et al.,
 Phys. Fluids 6, 1108 (1994)."""
 
 DELAYS = (0.003, 0.02, 0.1, 0.3)

@@ -201,7 +201,7 @@ def _guess_law(gas: Gas, rate: Any, free: tuple[str, ...]) -> dict[str, Any]:
         return {"drops": drops * (-np.log1p(-loss) / 2 / loss_now)}
     if isinstance(gas.law, Viscoelastic) and "dissipative_constant" in free:
         delta = rate / COOLING_RATE[gas.dimension]
-        # To the next order in delta the cooling rate is that of delta (1 - q delta / 2): invert it.
+        # To the next order in delta the cooling rate goes as delta (1 - q delta / 2): invert it.
         correction = 0.5 * COOLING_CORRECTION * delta
         delta = delta / (1 - np.minimum(correction, 0.7))
         T_0 = np.asarray(gas.temperature)
@@ -286,8 +286,8 @@ def _intercept_and_slope(times: np.ndarray, line: np.ndarray) -> tuple[Any, Any]
 def _guess_elements(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> dict[str, Any]:
     """Guess free parameters of the elements that are at an end of their range.
 
-    A fit in an unconstrained scale cannot start there. The guess of beta_t is 0, that of T_rot at
-    t = 0 the first measured one or a tenth of T_0, and that of a drag rate a tenth of the mean
+    A fit in an unconstrained scale cannot start there. The guess is 0 for beta_t; for T_rot at
+    t = 0 it is the first measured one or a tenth of T_0, and for a drag rate a tenth of the mean
     cooling rate.
     """
     measured = curve.rotational_temperature

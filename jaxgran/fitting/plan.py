@@ -349,7 +349,7 @@ def _of_this_material(
 def _fit(name: str, measurements: dict[str, Measurement], free: Any, quick: bool = False) -> Fit:
     """Fit measurements without warnings; errors begin with their name.
 
-    Several curves share the parameters of the material, and each has those of its scene.
+    Several curves share the parameters of the material; each has its own parameters of the scene.
     """
     curves = [m for m in measurements.values() if isinstance(m.data, CoolingCurve)]
     separate = ()

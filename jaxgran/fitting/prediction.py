@@ -102,7 +102,7 @@ class _Continuation:
         return np.where(self.is_before[:, None], continued, self.logs)
 
     def changes(self, of_logs: Float[np.ndarray, "nodes 2"]) -> Float[np.ndarray, "nodes 2"]:
-        """Return the derivatives of `values` from those of the logarithms at |t|."""
+        """Return the derivatives of `values` from the derivatives of the logarithms at |t|."""
         steepness = self.line / (2 - self.line)
         continued = of_logs[:1] - steepness * (of_logs - of_logs[:1])
         return np.where(self.is_before[:, None], continued, of_logs)

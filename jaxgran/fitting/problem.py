@@ -151,7 +151,7 @@ class Problem:
     def flat(self, values: dict[str, dict[str, Any]]) -> np.ndarray:
         """Return SI values, by label and name, in their unconstrained scale, in one array.
 
-        The values are those of all parameters of the gases, and of t0 where it is an unknown;
+        They are the values of all parameters of the gases, and of t0 where it is an unknown;
         nuisance parameters are 0.
         """
         parts = [np.zeros(0)]
@@ -275,7 +275,7 @@ class Problem:
 
 
 class _ComparedImpacts(NamedTuple):
-    """Measured impacts beside those of a gas.
+    """Measured impacts beside the impacts of a gas.
 
     Attributes:
         residuals: measured minus computed values over their errors, shape (values,).

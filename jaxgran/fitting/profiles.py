@@ -14,7 +14,7 @@ from jaxgran.fitting.rows import CurveRows
 from jaxgran.fitting.search import MAX_STEP, minimise, nearest, newton_step
 
 ALLOWED = 3.84
-"""Increase of -2 ln L over that of the law up to which its own parameters are allowed (5 % by
+"""Increase of -2 ln L over the fitted law up to which its own parameters are allowed (5 % by
 chance)."""
 
 ALLOWED_OVER_ALL = 3.84

@@ -43,13 +43,13 @@ class Fit:
         measurements: what was fitted, by label; "" is the label of a single measurement.
         gas: the fitted gas, including fitted values of all parameters that have priors.
         curve: the cooling curve of the fitted gas at the measured times; for a stochastic model
-            that of the last simulation, one step before the estimate. None for a drop test.
+            the curve of the last simulation, one step before the estimate. None for a drop test.
         estimate: estimates of the free parameters, SI, shape (p,).
         covariances: covariances of the estimates, SI, shape (p, p), by the source of the error:
             "measurement", the errors of the data; "few particles", the randomness of single
             collisions of N grains; "model", the error of the model's cooling rate in this scene;
             "model of T_rot" and "model of <dr^2>", the error of a common factor of these values;
-            "calibration", that of the scale of T; the name of a prior, for each of them; and for a
+            "calibration", the common scale of T; the name of a prior, for each of them; and for a
             stochastic model "simulation", its noise, and "slope", the bias of its derivatives.
         ranges: 95 % range of each free parameter, SI, over all explanations that the data do not
             exclude; {} where the alternatives were not compared.

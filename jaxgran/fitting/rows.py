@@ -116,7 +116,7 @@ class CurveRows:
         rate_error: times, s, and the relative error of the model's cooling rate at them.
         rotation_accuracy: relative accuracy of the model's T_rot.
         displacement: <dr^2>; None where it is not used.
-        offset: ln T and ln T_rot of the fitted model minus those of the model that is evaluated,
+        offset: ln T and ln T_rot of the fitted model minus the values of the evaluated model,
             at the times of the data.
         simulation: variances of ln T and ln T_rot by simulations, shape (times, 2).
     """

@@ -56,7 +56,7 @@ MAX_GROWTH = 10.0
 twice this value."""
 
 WINDOW = 20
-"""Number of steps whose mean loss is compared with that of as many steps before; a descent with
+"""Number of steps whose mean loss is compared with the mean of as many before; a descent with
 noise ends if the two differ by less than it."""
 
 PATIENCE = 50
@@ -260,7 +260,7 @@ def best_of_starts(
 ) -> tuple[Minimum, list[Minimum]]:
     """Search from a first guess and, if beta_t is free, also with other values of beta_t.
 
-    Returns the deepest minimum, whose steps are those of all searches, and all of them.
+    Returns the deepest minimum, with the number of steps of all searches, and all minima.
     """
     starts = [first]
     names = np.repeat([u.name for u in problem.unknowns], [u.size for u in problem.unknowns])

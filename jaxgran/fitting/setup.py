@@ -112,7 +112,7 @@ def _guesses(request: Request, problem: Problem) -> dict[str, Gas]:
             guesses[m.label] = with_values_of(m.gas, of_first_curve, request.names)
         else:
             guesses[m.label] = m.scene.replace(**of_drops[m.label])
-    # A drop test overrides all guesses but those of A and eps; the last one counts.
+    # A drop test overrides all guesses except for A and eps; the last one counts.
     known = {name: x for some in of_drops.values() for name, x in some.items()}
     better = {name: x for name, x in known.items() if name not in GUESSED_FROM_CURVES}
     for label, gas in guesses.items():

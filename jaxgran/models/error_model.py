@@ -25,8 +25,8 @@ ENSKOG_ERROR = (0.005, 0.1)
 """Relative error of Enskog's cooling rate in a small box, ``a + b phi``.
 
 Measured: the rate of hard spheres, N = 500, 8 replicas, 80 mean free times, beta_T0 = .15, is off
-by 0 +- .6 %, .5 +- .6 %, 1.3 +- .8 % at phi = .02, .05, .1, that of LAMMPS by 1 % at .05; the
-error that fluctuations do not explain at phi = .2, .3, .4 is 1.2, 2.8, 2.4 %.
+by 0 +- .6 %, .5 +- .6 %, 1.3 +- .8 % at phi = .02, .05, .1; the rate of LAMMPS is off by 1 % at
+phi = .05. The error that fluctuations do not explain at phi = .2, .3, .4 is 1.2, 2.8, 2.4 %.
 """
 
 CORRELATED_ERROR = {2: (0.003, 0.045), 3: (0.003, 0.02)}
@@ -75,11 +75,10 @@ WALL_ERROR = 0.012
 apart from the layer before them (`jaxgran.scene.elements`).
 
 Measured, phi = .03: the time in which hard spheres cool to T/T_0 = .5, .2, .1, .03 is longer than
-that of theory by 1.0, .7, .5, .3 +- .1 % for N = 250 and eps_w = .9, by 1.2, 1.0, .8, .7 % for
-N = 60, by .4, .5, .4, .4 % for N = 1000; by .2, .4, .3, .3 % for N = 250 and eps_w = .95, by .5,
-.6, .4, .4 % for .8, by -.7, -.1, -.1, .2 % for .6; with elastic walls they agree within .2 %. In
-the first sound times, until T has fallen to .7, it is longer by 8 % for eps_w = .6, by 1.3 % for
-.8.
+in theory by 1.0, .7, .5, .3 +- .1 % for N = 250 and eps_w = .9, by 1.2, 1.0, .8, .7 % for N = 60,
+by .4, .5, .4, .4 % for N = 1000; by .2, .4, .3, .3 % for N = 250 and eps_w = .95, by .5, .6, .4,
+.4 % for .8, by -.7, -.1, -.1, .2 % for .6; with elastic walls they agree within .2 %. In the first
+sound times, until T has fallen to .7, it is longer by 8 % for eps_w = .6, by 1.3 % for .8.
 """
 
 ELASTIC_WALL_ERROR = 0.004
@@ -100,8 +99,8 @@ ROUGHNESS_ERROR = 0.008
 """Relative error of kinetic theory's cooling rate of rough spheres.
 
 Measured: T within 1.2 % of DSMC up to 100 mean free times, beta_t = 0 to 1, with and without
-sliding (mu = .05 to 1); the mean rate of hard spheres, beta_t = -.3, until T has fallen to .03, is
-lower by .2 +- .3 %, and that of spheres that slide (mu = .2) by .4 to .7 +- .4 %."""
+sliding (mu = .05 to 1). The mean rate until T has fallen to .03, beta_t = -.3, is lower in hard
+spheres by .2 +- .3 %, with sliding (mu = .2) by .4 to .7 +- .4 %."""
 
 SLIDING_ERROR = 0.01
 """The same of spheres that slide, if their spins are Gaussian: T within 2 % of DSMC."""

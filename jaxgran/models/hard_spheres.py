@@ -42,8 +42,8 @@ class HardSpheres(AbstractSpheres):
 
     Between impacts spheres fly freely; an impact changes their velocities by
     ``+- (1 + eps(g)) g n / 2`` with the unit vector n between the centres and the normal speed g of
-    approach. The impacts are those of a serial event-driven code, but many are resolved at once:
-    all impacts that no other impact can precede.
+    approach. A serial event-driven code has the same impacts; here many are resolved at once,
+    namely all impacts that no other impact can precede.
 
     Inelastic collapse, infinitely many impacts in a finite time, is prevented by making an impact
     of a sphere elastic within ``contact_time`` of its last one (Luding & McNamara, Granular Matter
@@ -65,7 +65,7 @@ class HardSpheres(AbstractSpheres):
             describes what replicas share.
         contact_time: in mean free times of the homogeneous gas at the current temperature, in
             [0, 0.1]; 0 is the pure hard sphere, which may collapse.
-        start: initial positions and velocities instead of random ones; their box must be that of
+        start: initial positions and velocities instead of random ones; their box must be the box of
             the gas, and no spheres may overlap. In a container positions are coordinates from a
             corner, and centres must be at least a radius from each wall.
         neighbours: the search for pairs: "sweep" (for boxes of up to some thousand spheres),
@@ -76,7 +76,7 @@ class HardSpheres(AbstractSpheres):
             projected derivatives.
 
     Derivatives of T, T_rot and collisions are known in every parameter of the gas and in the times,
-    forward and reverse, for any law; of smooth spheres also those of the dissipated energy. The gas
+    forward and reverse, for any law, and of the dissipated energy for smooth spheres. The gas
     is assumed to remember its energies only, of translation and of rotation, whose tangents grow by
     what each impact, walls, drag and a drive exchange (`jaxgran.gradients.tangents`). Compared with
     finite differences d ln T/d ln A is right within 5 % in boxes shorter than L_c, but 14 % too
@@ -92,8 +92,8 @@ class HardSpheres(AbstractSpheres):
 
     The positions of spheres between walls are not remembered, except that the gas is denser before
     walls the more energy they take (`jaxgran.scene.elements`). Compared with differences (N = 500,
-    eps_w = .8) a derivative in eps_w is right within 2 %; that of T_rot in beta_t of rough walls,
-    before which spins differ from those in the middle, is up to 20 % too small.
+    eps_w = .8) a derivative in eps_w is right within 2 %. With rough walls the derivative of T_rot
+    in beta_t is up to 20 % too small, since spins near walls differ from spins in the middle.
 
     Raises:
         ValueError: for numbers out of range.

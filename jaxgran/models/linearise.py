@@ -124,8 +124,9 @@ def linearise(
 def _directions(gas: Gas, sizes: dict[str, int]) -> tuple[Gas, np.ndarray]:
     """Return tangents of a gas and of a shift of all times, with a first axis (directions,).
 
-    The first direction is that of time, and one follows for each number of some floats. Their
-    number is one of 4, 8, 16, ..., so that few programs are compiled.
+    The first direction shifts all times. One direction follows for each number of the floats in
+    `sizes`; the others are 0. There are 4, 8, 16, ... directions, so that few programs are
+    compiled.
     """
     count = max(4, 1 << sum(sizes.values()).bit_length())
     along = jax.tree.map(lambda x: np.zeros((count, *x.shape), x.dtype), gas)

@@ -86,7 +86,7 @@ class SoftSpheres(AbstractSpheres):
         steps_per_contact: steps in the mean contact duration at the current temperature, >= 10.
         replicas: number of independent boxes; two or more give error bars. `key` of `jaxgran.cool`
             describes what replicas share.
-        start: initial positions and velocities instead of random ones; their box must be that of
+        start: initial positions and velocities instead of random ones; their box must be the box of
             the gas.
         neighbours: the search for pairs: "sweep" (for boxes of up to some thousand spheres),
             "cells" (for larger ones), "jax-md" (not inside `jax.jit`), or "auto" for the fastest.

@@ -5,8 +5,8 @@ speed s.
 
 Instantaneous impacts with drag are computed in transformed time. Between collisions
 ``dv/dt = -gamma v``, and so ``v = u exp(-gamma t)`` with a velocity u that only collisions change.
-In the time ``s = (1 - exp(-gamma t))/gamma`` positions obey ``dx = u ds``: the sequence of
-collisions is that of a gas without drag. The laws of collision take the true velocities,
+In the time ``s = (1 - exp(-gamma t))/gamma`` positions obey ``dx = u ds``, so that the sequence of
+collisions is the same as without drag. The laws of collision take the true velocities,
 ``v = u (1 - gamma s)``, and the true spins, which decay at another rate. A run stores u, and spins
 without their decay.
 """
@@ -137,7 +137,7 @@ def random_kicks(
     """Draw kicks with components of mean 0 and variance 1, in the shape of velocities.
 
     Each component is the number of ones in 16 random bits, centred and scaled. Its fourth moment is
-    4 % below that of a Gaussian number. Sums over the many small kicks of a mean free time are
+    4 % below the value of a Gaussian number. Sums over the many small kicks of a mean free time are
     Gaussian.
 
     Args:
@@ -195,7 +195,7 @@ def tangential_impulse(
     """Return the tangential part of impacts, ``-eta`` times the slip: see `jaxgran.Rough`.
 
     Args:
-        relative: velocity of the first partner minus that of the second.
+        relative: velocity of the first partner relative to the second, v_1 - v_2.
         spin: sum of the spins of both partners; a wall has none.
         normal: unit vector from the first to the second.
         where: mask of the impacts with friction.

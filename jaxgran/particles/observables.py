@@ -224,7 +224,7 @@ def pair_correlation(
     """Return the radial distribution function g(r), which is 1 for independent particles.
 
     ``g = pairs / (centres n V_shell)`` with the number density n. Its relative statistical error is
-    about 1 / sqrt(number of pairs in the bin). The time is that of N times `centres` distances.
+    about 1 / sqrt(number of pairs in the bin). The cost is N times `centres` distances.
 
     Args:
         position: positions, in any periodic images.

@@ -60,7 +60,8 @@ MAX_ROWS_PER_PARTICLE = 100
 MIN_SPHERES_PER_RUN = 8192
 """Smallest number of spheres in a replica with which replicas run one after the other.
 
-Time of four replicas one after the other, over that of one array, on one core:
+Run time of four replicas one after the other, over the run time of the same four in one array, on
+one core:
 
     spheres     1000   2000   4096
     hard         1.4    1.1    0.9
@@ -193,7 +194,10 @@ class Groups(NamedTuple):
         return np.minimum(np.arange(-(-self.number // shared) * shared), self.number - 1)
 
     def keys(self, key: PRNGKeyArray) -> Array:
-        """Return a key of each group: that of group k of several is ``fold_in(key, k)``."""
+        """Return a key for each group.
+
+        A single group has `key`; group k of several has ``fold_in(key, k)``.
+        """
         if self.number == 1:
             return key[None]
         return jax.vmap(partial(jax.random.fold_in, key))(self.rows)

@@ -38,9 +38,9 @@ EQUILIBRATION_COLLISIONS = 10.0
 """Duration of the equilibration, in mean free times."""
 
 MAX_EQUILIBRATION = 2e4
-"""Longest equilibration, in diameters over the thermal speed. Below a packing fraction of 6e-5
-random positions are those of a gas, but for a share of this size, and flights of many boxes would
-take minutes."""
+"""Longest equilibration, in diameters over the thermal speed. It takes effect below a packing
+fraction of 6e-5. There random positions are distributed as in a gas, apart from a share of this
+size, and flights through many boxes would take minutes."""
 
 SETTLING_COLLISIONS = 2.0
 """Mean free times of equilibration after which the capacity of the run is sufficient."""

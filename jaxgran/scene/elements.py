@@ -79,7 +79,7 @@ class Rough(Element):
     Raises:
         ValueError: for a value outside its range.
 
-    Reference: Huthmann & Zippelius, Phys. Rev. E 56, R6275 (1997). The law with friction is that of
+    Reference: Huthmann & Zippelius, Phys. Rev. E 56, R6275 (1997). The law with friction is by
     Walton (1993), as Foerster, Louge, Chang & Allia measured it on beads, Phys. Fluids 6, 1108
     (1994).
 

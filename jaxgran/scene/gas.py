@@ -475,7 +475,7 @@ class Gas(eqx.Module):
         later, when the flow is strong enough to sweep the spheres together. In two-dimensional
         boxes of 8 to 10 L_c, T departs by 5 % from homogeneous cooling after 20 (phi = 0.245,
         eps = 0.9) and 5 (phi = 0.05, eps = 0.6) collisions per particle, and density fluctuations
-        reach twice those of an elastic fluid after 55 and 7
+        are twice as strong as in an elastic fluid after 55 and 7
         (``experiments/paper/paper_clustering.py``). In shorter boxes this happens later or never.
         L_c is infinite for elastic spheres.
         """
@@ -679,7 +679,7 @@ def reduced_scene(gas: Gas) -> ReducedScene:
 def _reduced_sizes(gas: Gas, spread: Float[Array, ""]) -> ReducedSizes:
     """Return two sizes in equal numbers that have the mean and the spread of the diameters.
 
-    eps of unequal spheres is that of equal ones with the same effective radius and effective mass.
+    Unequal spheres have the eps of equal ones with the same effective radius and effective mass.
     """
     d = gas.dimension
     diameters = jnp.stack([1 - spread, 1 + spread])

@@ -440,8 +440,8 @@ class Viscoelastic(RestitutionLaw):
     def of_wall(self) -> "Viscoelastic":
         """Return the law of two spheres that collide as a sphere and a flat wall of this material.
 
-        The effective radius and mass of a sphere and a wall are twice those of two spheres, so that
-        ``alpha``, proportional to ``Y sqrt(R_eff)/m_eff``, is smaller by the factor sqrt(2).
+        The effective radius and mass are twice as large for a sphere and a wall as for two spheres,
+        so that ``alpha``, proportional to ``Y sqrt(R_eff)/m_eff``, is smaller by a factor sqrt(2).
         """
         return eqx.tree_at(lambda law: law.youngs_modulus, self, self.youngs_modulus / 2**0.5)
 
@@ -490,8 +490,8 @@ class ViscoelasticVariant(Viscoelastic):
     """Viscoelastic spheres, or spheres of another law: an alternative explanation of a curve.
 
     ``beta = (3/2) A alpha^(2/5) v_0^(1/5) (v/v_0)^exponent`` at the normal speed v, with v_0 = .1
-    m/s: 1/5 is the viscoelastic law, 0 a constant eps. In each impact eps is that of v plus an
-    independent normal deviate of the standard deviation `spread`; values above 1 become 1.
+    m/s: 1/5 is the viscoelastic law, 0 a constant eps. In each impact an independent normal deviate
+    of standard deviation `spread` is added to eps(v); sums above 1 become 1.
     """
 
     exponent: Float[Array, ""] = eqx.field(converter=float_array, default=VISCOELASTIC_EXPONENT)
@@ -626,15 +626,16 @@ class RestitutionSpline(RestitutionLaw):
     In fits ``p = (dL/d ln v)/L_last``, with L at the last knot, has a smoothness prior: over a
     factor of ten in v it changes by `smoothness` (one standard deviation of a random walk), since a
     curve T(t) averages over speeds. Viscoelastic spheres have p = 1/5 at the last knot and .13 at a
-    tenth of its speed, a constant eps has p = 0. A wide prior keeps drops that the data do not see
-    finite: their logarithms, over L_last, are those of ``L ~ v^(1/5)`` with a standard deviation of
-    3.
+    tenth of its speed, a constant eps has p = 0. A wide prior keeps those drops finite that the
+    data do not see: ``ln(drop/L_last)`` has its mean where ``L ~ v^(1/5)``, and a standard
+    deviation of 3.
 
     Args:
         speeds: knots, normal approach speeds, m/s, > 0, increasing, two or more;
             `visited_speeds` gives the range that a measured curve determines.
-        values: eps at the knots, in (0, 1], not increasing; by default that of L = 0.1 at the last
-            knot and p = 1/5. A fit begins with a multiple of this L that cools as the curve does.
+        values: eps at the knots, in (0, 1], not increasing; by default from
+            ``L = 0.1 (v/v_last)^(1/5)``. A fit begins with a multiple of this L that cools as the
+            curve does.
         smoothness: standard deviation of p over a factor of ten in v, > 0.
 
     Raises:

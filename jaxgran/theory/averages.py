@@ -45,11 +45,11 @@ CLOSURE = {2: (0.1127, 0.2725, 4.1658, -2.8628), 3: (0.0667, 0.2452, 4.8105, -1.
 
 The Sonine series of an inelastic gas is asymptotic, since its velocity distribution falls off
 exponentially: cut off behind a_3 it gives an a_2 that is 6 % (3D) and 11 % (2D) too small at
-eps = .5 and 28 % and 40 % at 0, and cut off behind a_4 one that is too large. The term in a_2^2 is
-that of a gas whose temperature varies in space or time. The numbers were chosen so that a_2 and a_3
-of the homogeneous cooling state agree with direct simulation by an independent code (constant eps
-from 0 to .95); ``experiments/accuracy/particle_statistics.py`` measures how well they agree with
-DSMC.
+eps = .5 and 28 % and 40 % at 0, and cut off behind a_4 one that is too large. A gas whose
+temperature varies in space or time has the term in a_2^2. The numbers were chosen so that a_2 and
+a_3 of the homogeneous cooling state agree with direct simulation by an independent code (constant
+eps from 0 to .95); ``experiments/accuracy/particle_statistics.py`` measures how well they agree
+with DSMC.
 """
 
 
@@ -338,17 +338,17 @@ def rough_impact_means(
     d: int,
     gaussian: bool = False,
 ) -> list[Float[Array, "spheres n"]]:
-    """Return mean changes of a sphere in an impact, times the rate of impacts over that at T = 1.
+    """Return mean changes of a sphere in an impact, times the impact rate over its value at T = 1.
 
     The components of velocities v and of ``s = (sigma/2) w`` are Gaussian. Given the slip u and the
-    normal speed g, those of v and s along the slip are Gaussian around ``(T/V) u`` and ``(a/V) u``.
-    The impulse along the slip is the smaller one of eta u and Coulomb's limit.
+    normal speed g, the components along the slip are Gaussian, around ``(T/V) u`` for v and around
+    ``(a/V) u`` for s. The impulse along the slip is the smaller one of eta u and Coulomb's limit.
 
     Args:
         T: variances of the components of v of both spheres.
-        a: those of the components of s.
+        a: variances of the components of s of both spheres.
         S: variance of the components of the relative velocity, the sum of the two T.
-        V: variance of those of the slip, S and the sum of the two a.
+        V: variance of the components of the slip, the sum of S and of the two a.
         m: see `slip_moments`, with ``m = mu (1 + eps)/2 / eta sqrt(S/V)``; None without a limit.
         kick: (1 + eps)/2.
         eta: coefficient of `Rough`.
@@ -422,7 +422,7 @@ def rough_energy_moments(
         eta: coefficient of `Rough`.
         inertia: q.
         S: variance of the components of the relative velocity over T, 2 of two Maxwellian spheres.
-        A: that of the sum of both (sigma/2) w, 2 T_rot/(q T).
+        A: the same for the sum of both (sigma/2) w, 2 T_rot/(q T).
         d: dimension.
 
     Returns:
@@ -566,8 +566,8 @@ def log_temperature_range(
         law: law of restitution in units of `Gas.impact_speed`.
         duration: reduced time.
         dimension: d.
-        bounds: of the effects of the elements of the scene on T (`element_bounds`); by default
-            those of smooth spheres without walls, drag and drive.
+        bounds: of the effects of the elements of the scene on T (`element_bounds`); by default for
+            smooth spheres without walls, drag and drive.
     """
     law, duration, bounds = jax.lax.stop_gradient((law, duration, bounds))
     by_speed, constant, heating, rotation = bounds

@@ -127,12 +127,13 @@ def run_covariance(
         spins: T_rot/T and the cumulants of the spins at these times, as in `Moments`; without them
             spins are taken to be Gaussian, and C of T_rot is some 7 % too low.
         rotation: return the covariance of ln T_rot, too.
-        energy: T is that by the energy, see `jaxgran.theory.sizes`.
+        energy: T is the mean energy over the mean mass, see `jaxgran.theory.sizes`.
         softness, correlations: as in `jaxgran.KineticTheory`.
 
     Returns:
         C of ln T, shape (times, times); with `rotation` of ln T, then of ln T_rot, shape (2 times,
-        2 times). T_0 and T_rot_0 are those of the run: C is 0 at t = 0, and where T_rot is 0.
+        2 times). T_0 and T_rot_0 are the exact initial values of the run: C is 0 at t = 0. C of
+        ln T_rot is also 0 where T_rot is 0.
     """
     theta = curve.temperature / gas.temperature
     ratio = jnp.zeros_like(theta)

@@ -1,6 +1,6 @@
 """Corrections of the cooling rate at finite density: correlated velocities and soft contacts.
 
-Units are those of `jaxgran.theory.averages`; functions of a `Gas` use SI units.
+Units are the same as in `jaxgran.theory.averages`; functions of a `Gas` use SI units.
 """
 
 from math import gamma, log, pi, sqrt
@@ -22,8 +22,9 @@ MAX_WAVENUMBER = {2: (0.181, 3.10), 3: (0.926, 2.19)}
 
 Fitted to ``experiments/accuracy/measure_correlations.py``: hard spheres of eps = .7 and .9 at phi =
 .05 to .3. With two numbers chi^2 is 7 (2D) and 10 (3D) for nine gases. Errors: 2D .05, .24; 3D .07,
-.32. With --full gases of eps = .95, to which nothing was fitted, agree in 3D, but those of eps =
-.8 and phi >= .2 cool up to 1 % faster than this predicts, and disks of phi >= .2 up to 2 %.
+.32. Gases of --full to which nothing was fitted: in 3D those with eps = .95 agree, and for eps = .8
+and phi >= .2 they cool up to 1 % faster than this predicts; disks of phi >= .2 cool up to 2 %
+faster.
 """
 
 MIN_WAVENUMBER = 2.0
@@ -145,12 +146,13 @@ def is_soft(law: ReducedLaw) -> bool:
 def crowding_coefficient(gas: Gas) -> Float[Array, ""]:
     """Return k in ``1/(1 + k X_T/sigma)``, the effect of soft contacts that needs finite density.
 
-    As beta -> 0, velocities are independent of positions, and the loss is that of the equilibrium
-    fluid: proportional to ``int sqrt(xi) exp(-U/T) y(sigma - xi) dxi`` with the cavity function y
-    of spheres whose excluded diameter is smaller by ``1.280 X_T``. In addition, contacts hold the
-    energy ``U/K = (2/(5 d)) nu t_c``, which is proportional to T^(2/5) and is lost along with T:
-    ``k = 1.280 d ln g_2/d ln sigma + (1.280 - .969) s + (7/5) (2/(5 d)) nu t_c sigma/X_T`` with the
-    slope ``s = -d ln g/d ln r`` of the pair correlation at contact. It is 0 for a dilute gas.
+    As beta -> 0, velocities are independent of positions, and the loss is an average over the
+    equilibrium fluid. It is proportional to ``int sqrt(xi) exp(-U/T) y(sigma - xi) dxi`` with the
+    cavity function y of spheres whose excluded diameter is smaller by ``1.280 X_T``. In addition,
+    contacts hold the energy ``U/K = (2/(5 d)) nu t_c``, which is proportional to T^(2/5) and is
+    lost along with T: ``k = 1.280 d ln g_2/d ln sigma + (1.280 - .969) s + (7/5) (2/(5 d)) nu t_c
+    sigma/X_T`` with the slope ``s = -d ln g/d ln r`` of the pair correlation at contact. It is 0
+    for a dilute gas.
 
     Args:
         gas: the scene.

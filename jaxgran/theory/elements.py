@@ -1,6 +1,6 @@
 """Rates of change by the elements of a scene: roughness, walls, drag and a drive.
 
-Units are those of `jaxgran.theory.averages`; functions of a `Gas` use SI units.
+Units are the same as in `jaxgran.theory.averages`; functions of a `Gas` use SI units.
 """
 
 from math import pi, sqrt
@@ -215,12 +215,12 @@ def _wall_rates(
 
     A wall takes ``(1 - eps^2) v_n^2/2`` in an impact, on average ``(1 - eps^2) T`` at constant eps.
     It takes more from fast spheres, which come more often, and so changes a_2, at constant eps and
-    Z impacts by ``(4/d) Z (1 - eps^2) (a_2 - (2 eps^2 - 1)/(d + 2))``. A mean power k of the speeds
-    is that of a Maxwellian gas times ``1 + k (k - 2) a_2/8``.
+    Z impacts by ``(4/d) Z (1 - eps^2) (a_2 - (2 eps^2 - 1)/(d + 2))``. The mean k-th power of the
+    speed is ``1 + k (k - 2) a_2/8`` times its value in a Maxwellian gas.
     Friction at a wall takes from one sphere what friction between two spheres takes from both, each
     of which has half of the mean squared relative velocity. So walls count as twice as many impacts
-    between spheres, with half the eta of a wall. Walls reverse velocities: displacements are not
-    those of a free gas.
+    between spheres, with half the eta of a wall. Walls reverse velocities, which changes the
+    displacements.
     """
 
     def axis_rates(frequency: Array) -> ElementRates:
@@ -293,7 +293,7 @@ def element_bounds(scene: ReducedScene, dimension: int) -> ElementBounds:
     if scene.drag is not None:
         constant = 2 * scene.drag.rate
     if scene.sizes is not None:
-        # Impacts at most twice as fast, and all energy that of the small spheres.
+        # Impacts cool at most twice as fast, and small spheres have at most all of the energy.
         one = jnp.ones_like(scene.sizes.spread)
         by_speed = by_speed - equal_rates(scene.law, one, 0.0, d)
         small, large = scene.sizes.masses

@@ -4,9 +4,9 @@ Their terms come from `jaxgran.theory.averages` (impacts), `jaxgran.theory.eleme
 walls, drag, a drive), `jaxgran.theory.sizes` (unequal sizes) and `jaxgran.theory.density` (finite
 density).
 
-Units are those of `jaxgran.theory.averages`. "The paper" is Brilliantov & Poeschel, Self-diffusion
-in granular gases, Phys. Rev. E 61, 1716 (2000), whose equations are numbered here as in the
-authors' preprint.
+Units are the same as in `jaxgran.theory.averages`. "The paper" is Brilliantov & Poeschel,
+Self-diffusion in granular gases, Phys. Rev. E 61, 1716 (2000), whose equations are numbered here as
+in the authors' preprint.
 """
 
 from functools import partial
@@ -74,7 +74,7 @@ class Equations(NamedTuple):
 
     @property
     def names(self) -> list[str]:
-        """Names of the `Moments`, without those of spins."""
+        """Names of the `Moments`, except the moments of spins."""
         names = list(Moments._fields[: 5 if self.spreading else 3])
         if self.order > 2:
             names += ["third_sonine"] + (["diffusion_shape"] if self.spreading else [])
@@ -215,10 +215,10 @@ class SizeRates(NamedTuple):
     """What unequal sizes add to the rates of change of a gas of equal spheres.
 
     Attributes:
-        impacts: d ln T/dt by impacts, minus that of equal spheres.
+        impacts: d ln T/dt by impacts, minus its value for equal spheres.
         drag: the same by drag.
         ratio: dq/dt.
-        collisions: number of collisions over that of equal spheres.
+        collisions: collision rate over the rate of equal spheres.
     """
 
     impacts: Float[Array, ""]

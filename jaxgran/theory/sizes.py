@@ -1,9 +1,9 @@
 """Gases whose spheres differ in size: rates of cooling and of exchange, and their noise.
 
 The distribution of diameters is represented by two halves, of diameters ``sigma (1 - s)`` and
-``sigma (1 + s)``, which have its mean and its standard deviation ``s sigma``: all results are of
-second order in s, for any distribution, and those of two sizes in equal numbers are complete. All
-spheres consist of one material: masses are in proportion to the cubes of diameters.
+``sigma (1 + s)``, which have its mean and its standard deviation ``s sigma``. All results are
+correct to second order in s for any distribution, and to all orders for two sizes in equal numbers.
+All spheres consist of one material: masses are in proportion to the cubes of diameters.
 
 Each half is Maxwellian and has its own mean square velocity ``d T_1`` and ``d T_2``, with ``T =
 (T_1 + T_2)/2``. The second variable is ``q = ln(T_1/T_2)``; it is 0 at t = 0, where small and large
@@ -146,6 +146,8 @@ def variable_changes(ratio: Float[Array, ""], d: int) -> Float[Array, "2 2"]:
 
 
 def drag_factors(sizes: ReducedSizes) -> Float[Array, "2"]:
-    """Return the drag of small and large spheres over that of the mean diameter: by Stokes' law the
-    rate is in inverse proportion to the square of the diameter."""
+    """Return the drag rates of small and large spheres over the rate of the mean diameter.
+
+    By Stokes' law the rate is inversely proportional to the square of the diameter.
+    """
     return sizes.masses ** (-2 / 3)

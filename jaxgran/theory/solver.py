@@ -1,7 +1,7 @@
 """Integration of the equations of a homogeneous gas: its moments at given times, and derivatives.
 
-`integrate_at` solves ordinary differential equations with output at given times. Steps and their
-sizes are those of diffrax; the loop around them is written here because it takes half as long to
+`integrate_at` solves ordinary differential equations with output at given times. diffrax makes the
+steps and chooses their sizes. The loop around them is written here because it takes half as long to
 compile as `diffrax.diffeqsolve` with its events, adjoints and rounding of times.
 
 `MomentSolver.moments` has one linear rule for forward and reverse mode: the tangents of those
@@ -357,7 +357,7 @@ class MomentSolver(NamedTuple):
         # With nan parameters the state stays constant, so that the solver does not shorten its
         # steps.
         times = jnp.where(known, times, jnp.linspace(1.0, 2.0, times.size, dtype=dtype))
-        # The state alone controls the steps: its tangents are then those of the discrete solution.
+        # Only the state controls the steps: tangents are then derivatives of the discrete solution.
         controller = diffrax.PIDController(
             rtol=self.rtol,
             atol=self.rtol,

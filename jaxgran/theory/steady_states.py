@@ -1,6 +1,6 @@
 """Steady states of gases that white noise drives.
 
-Units are those of `jaxgran.theory.averages`; functions of a `Gas` use SI units.
+Units are the same as in `jaxgran.theory.averages`; functions of a `Gas` use SI units.
 """
 
 from typing import NamedTuple

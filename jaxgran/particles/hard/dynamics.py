@@ -486,7 +486,7 @@ def hard_records(state: SphereState, scene: SphereScene, replicas: int) -> Recor
 def _values_with_elements(
     state: SphereState, scene: SphereScene, values: dict[str, Array]
 ) -> dict[str, Array]:
-    """Return the records that drag changes, and those of rotation."""
+    """Return the records of rotation, and the records that drag changes."""
     replicas = len(values["temperature"])
     n = len(state.velocity) // replicas
     d = state.velocity.shape[1]

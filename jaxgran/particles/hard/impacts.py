@@ -48,10 +48,11 @@ class ImpactEvents(NamedTuple):
     Attributes:
         time: of the gas.
         normal: from the first sphere out into the second, or into the wall.
-        relative: velocity of the first less that of the second, or of the sphere.
+        relative: velocity of the first sphere relative to the second, v_1 - v_2; at a wall, the
+            velocity of the sphere.
         speed: its normal part.
-        spin: sum of the (transformed) spins of both spheres, or that of the sphere; None of smooth
-            spheres.
+        spin: sum of the (transformed) spins of both spheres; at a wall, the spin of the sphere.
+            None of smooth spheres.
         elastic: whether the impact is elastic and smooth.
     """
 
@@ -88,8 +89,8 @@ def impact_effect(
     """Return the effect of impacts of two spheres, or on walls across an axis; see `jaxgran.Rough`.
 
     Walls that are closer together or dissipate more are hit more often, see `wall_impact_ratio`. A
-    tangent knows neither the positions of walls nor those of spheres, but only how often a gas
-    meets the walls: energies at walls have a factor of value 1 that carries this dependence.
+    tangent does not know where walls and spheres are, but only how often a gas meets the walls:
+    energies at walls have a factor of value 1 that carries this dependence.
     """
     material = scene.material
     speed = impact.speed

@@ -577,8 +577,8 @@ def _material_by_replica(
 ) -> tuple[ReducedScene, ReducedScene]:
     """Return a material without surfaces and its tangents, by replica.
 
-    Velocities that are (1 + c/2) times as large in the same material are those of a slower clock
-    in the material for spheres that are (1 - c/2) times as fast.
+    In the same material spheres that are (1 + c/2) times as fast take the paths of the original
+    spheres in the material ``_faster(material, 1 - c/2)``. Only their clocks differ.
     """
     c = tangents.log_temperature
     one = jnp.ones_like(tangents.elapsed)
@@ -625,8 +625,8 @@ def rotational_temperature(
 def soft_records(state: SphereState, scene: SphereScene, replicas: int) -> Records:
     """Return the records of a state.
 
-    The derivative of T is that of the run up to the projection; the derivatives of the other
-    records are estimated from it. The elastic energy goes as ``T^(7/5) alpha^(-2/5)``.
+    The derivative of T is the projected tangent of the run; the derivatives of the other records
+    are estimated from it. The elastic energy goes as ``T^(7/5) alpha^(-2/5)``.
     """
     values, velocity = common_values(state, scene, replicas)
     num_particles, d = velocity.shape[1:]

@@ -3,8 +3,8 @@
 Units: see `jaxgran.scene.gas.SphereScene`. Spins are (sigma/2) w.
 
 Without drag a sphere flies freely between contacts. With drag ``dv/dt = -gamma v``, so that
-``v(t) = v exp(-gamma t)`` and ``x(t) = x + v (1 - exp(-gamma t))/gamma``: the path is that of free
-flight, and only the time along it differs.
+``v(t) = v exp(-gamma t)`` and ``x(t) = x + v (1 - exp(-gamma t))/gamma``: a sphere flies along the
+same straight line, only more slowly.
 """
 
 from typing import Any, NamedTuple
@@ -200,7 +200,7 @@ def tangential_kick(
     """Return the kick ``-dt min(viscous |u|, limit) u/|u|`` at the mean slip u, and the energy
     lost.
 
-    The mean is that of the slips before and after a viscous kick, as in `midpoint_rate`. The energy
+    u is the mean of the slips before and after a viscous kick, as in `midpoint_rate`. The energy
     lost is exactly the change of the kinetic energy. See `jaxgran.Frictional` for the force.
 
     Args:
@@ -257,8 +257,9 @@ def integrate(
     """Integrate the members of a block over its time steps.
 
     Drift-kick-drift steps of equal length, second order. The drift is exact, with drag too. The
-    kick is by the normal forces of pairs, then by those of walls, then by tangential forces of
-    walls and of pairs, each an implicit midpoint rule at fixed positions.
+    kick is by the normal forces of pairs, then by the normal forces of walls, then by the
+    tangential forces of walls and of pairs. Each of them is an implicit midpoint rule at fixed
+    positions.
 
     Args:
         scene: the gas.
