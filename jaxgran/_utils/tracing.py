@@ -124,7 +124,7 @@ def fast_compilation(backend: str) -> dict[str, Any]:
 def fast_jit(function: Callable[..., Any], backend: str) -> Any:
     """Return a function, compiled once for all, with the options of `fast_compilation`."""
     options: dict[str, Any] = {"compiler_options": fast_compilation(backend)}
-    return eqx.filter_jit(function, **options)
+    return jax.jit(function, **options)
 
 
 def nan_where(failed: Bool[Array, "..."], x: Array) -> Array:
