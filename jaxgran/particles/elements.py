@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jax.extend.random import threefry_2x32
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, UInt32
 
 from jaxgran.gradients.tangents import ExchangeTangents
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
@@ -163,6 +164,16 @@ def random_kicks(
 def threefry_key(words: Array) -> PRNGKeyArray:
     """Return a threefry key from two 32-bit words; its numbers are the same under `jax.vmap`."""
     return jax.random.wrap_key_data(words, impl="threefry2x32")
+
+
+def random_words(key: PRNGKeyArray, count: int) -> UInt32[Array, "2 count"]:
+    """Return two random 32-bit words for each of `count` calls of threefry.
+
+    `jax.random.bits` makes one word of 32 bits of each call.
+    """
+    first, second = jax.random.key_data(key)
+    counters = jnp.arange(2 * count, dtype=jnp.uint32)
+    return threefry_2x32((first, second), counters).reshape(2, count)
 
 
 def surface_direction(

@@ -49,6 +49,7 @@ from jaxgran.particles.elements import (
     exchange_slopes,
     kick_variance,
     random_kicks,
+    random_words,
     tangential_impulse,
     threefry_key,
 )
@@ -489,7 +490,7 @@ class DSMCDynamics(AbstractDynamics):
         d = self.scheme.dimension
         first = self.scheme.first
         second = self.scheme.second
-        bits = jax.random.bits(key, (2, first + second + 2), jnp.uint32)
+        bits = random_words(jax.random.fold_in(key, 0), first + second + 2)
         i, j, k = draw_pairs(bits[:, -2:].ravel(), self.scheme)
         index = jnp.concatenate([i, j, k])
         options = {"mode": "promise_in_bounds", "unique_indices": True}
