@@ -147,8 +147,8 @@ def test_each_of_a_few_particles_meets_the_others():
 
 
 def test_collisions_scatter_as_a_poisson_process():
-    # An elastic gas of constant T. A quarter of the candidates collide: with steps of fixed length
-    # the ratio would be .75.
+    # An elastic gas of constant T. A third of the candidates collide: with steps of fixed length
+    # the ratio would be .68.
     n, replicas, taus = 101, 4000, np.array([0.02, 3.0])
     (curve,) = curves_of(constant(1.0), taus, DSMC(n, replicas=replicas, step=0.01))
     collisions = np.asarray(curve.replicas.collisions) * n / 2
