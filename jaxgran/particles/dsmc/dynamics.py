@@ -87,8 +87,8 @@ class DSMCGas(NamedTuple):
         time_rest: rounding error of `time`, for a compensated sum.
         duration: length of the next step over its mean, see `waiting_time`.
         temperature: T/T_0, updated by the losses, recomputed every `RECOUNT_INTERVAL` steps.
-        particles: the 2 d components of v and of x - v t, which only collisions change, and the
-            spins of rough spheres. With drag they are transformed, see `elements`.
+        particles: the d components of v, the spins of rough spheres, and the d components of
+            x - v t, which only collisions change. With drag they are transformed, see `elements`.
         collisions: number of pairs that collided.
         missed: number of collisions missed because of the `CEILING`.
         steps: number of steps.
@@ -201,12 +201,13 @@ class DSMCDynamics(AbstractDynamics):
         key = jax.random.fold_in(threefry_key(words), 2**32 - 1)
         velocity = maxwellian_velocities(key, self.shape)
         v = velocity.reshape(replicas, -1, d)
-        parts = [v / sqrt(2), jnp.zeros_like(v)]
+        parts = [v / sqrt(2)]
         if scene.surface is not None:
             key = jax.random.fold_in(key, 0)
             mean_square = (scene.surface.ratio / (2 * scene.surface.inertia)).astype(v.dtype)
             spins = maxwellian_spins(key, (replicas, n, NUM_SPIN_COMPONENTS[d]), mean_square)
             parts.append(spins)
+        parts.append(jnp.zeros_like(v))
         tangents = None
         if directions is not None:
             tangents = ExchangeTangents.initial(directions, scene, velocity, replicas)
@@ -275,7 +276,7 @@ class DSMCDynamics(AbstractDynamics):
         velocity = particles[..., :d] * decay.velocity
         spin = None
         if self.scene.surface is not None:
-            spins = particles[..., 2 * d :] * decay.true_spin
+            spins = particles[..., d:-d] * decay.true_spin
             spin = spins.reshape(-1, spins.shape[-1])
         velocity = velocity.reshape(-1, d)
         return jnp.full_like(velocity, jnp.nan), velocity, spin
@@ -474,7 +475,7 @@ class DSMCDynamics(AbstractDynamics):
             v = rows[:, :d]
             kicks = random_kicks(jax.random.fold_in(key, i), v, at_rest, belongs)
             kicks = jnp.where(belongs[:, None], size * kicks, 0.0)
-            after = [v + kicks, rows[:, d : 2 * d] - time * kicks, rows[:, 2 * d :]]
+            after = [v + kicks, rows[:, d:-d], rows[:, -d:] - time * kicks]
             return jnp.concatenate(after, axis=-1), jnp.sum(kicks * (2 * v + kicks))
 
         first = kicked * (2 * gas.steps + place).astype(jnp.int32)
@@ -494,9 +495,9 @@ class DSMCDynamics(AbstractDynamics):
         i, j, k = draw_pairs(bits[:, -2:].ravel(), self.scheme)
         index = jnp.concatenate([i, j, k])
         options = {"mode": "promise_in_bounds", "unique_indices": True}
-        old = gas.particles.at[index].get(**options)
+        old = gas.particles.at[index, :-d].get(**options)
         v = old[:, :d]
-        spin = old[:, 2 * d :]
+        spin = old[:, d:]
         # Collisions happen at the middle of the step, on average: x - v t changes by -kick t.
         middle = gas.time + dt / 2
         ceiling = CEILING * jnp.sqrt(gas.temperature)
@@ -522,10 +523,9 @@ class DSMCDynamics(AbstractDynamics):
         more, two = collided(seconds, second_spins, bits[:, first:-2])
         kicks = jnp.concatenate([kick[:second] + two.kick, kick[second:], -kick, -two.kick])
         turns = [turn[:second] + two.spin_change, turn[second:], turn, two.spin_change]
-        changes = [kicks, -middle * kicks, jnp.concatenate(turns)]
-        new = old + jnp.concatenate(changes, axis=-1)
+        changes = [kicks, jnp.concatenate(turns), -middle * kicks]
         sums = one._replace(num=one.num + two.num, missed=one.missed + two.missed)
-        particles = gas.particles.at[index].set(new, **options)
+        particles = gas.particles.at[index].add(jnp.concatenate(changes, axis=-1), **options)
         return particles, sums, jax.tree.map(jnp.add, gains, more)
 
     def _hit_walls(
@@ -563,7 +563,7 @@ class DSMCDynamics(AbstractDynamics):
             ) -> tuple[Array, tuple[Array, Array]]:
                 """Return the gains, and velocities and spins after impacts."""
                 velocity = rows[:, :d] * faster
-                spin = rows[:, 2 * d :] * turning
+                spin = rows[:, d:-d] * turning
                 walls = scene.walls
                 surface = scene.surface
                 frequency = walls.frequency[axis]
@@ -595,7 +595,7 @@ class DSMCDynamics(AbstractDynamics):
                 return jnp.stack(gains), after
 
             gains, (velocity, spin) = self._exchanged(of_scene, middle, gas.tangents)
-            return jnp.concatenate([velocity, rows[:, d : 2 * d], spin], axis=-1), gains
+            return jnp.concatenate([velocity, spin, rows[:, -d:]], axis=-1), gains
 
         shapes = jax.eval_shape(hit_rows, jnp.int32(0), particles[:1], jnp.ones(1, bool))[1]
         zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
@@ -665,7 +665,7 @@ class DSMCDynamics(AbstractDynamics):
             by_scale = by_scale.at[0, 0].add(-heat)
         energies = [jnp.sum(before.particles[:, :d] ** 2)]
         if scene.surface is not None:
-            energies.append(scene.surface.inertia * jnp.sum(before.particles[:, 2 * d :] ** 2))
+            energies.append(scene.surface.inertia * jnp.sum(before.particles[:, d:-d] ** 2))
         return before.tangents.after(
             jnp.stack(energies), values, by_direction, by_scale, collisions
         )
@@ -695,11 +695,11 @@ def dsmc_records(dynamics: DSMCDynamics, state: DSMCState) -> Records:
         "collisions": 2 / n * gas.collisions,
     }
     if scene.walls is None:  # walls would limit <dr^2>
-        position = gas.particles[..., d : 2 * d] + gas.time[:, None, None] * v
+        position = gas.particles[..., -d:] + gas.time[:, None, None] * v
         displacement = position - jnp.mean(position, axis=1, keepdims=True)
         values["displacement"] = observables.mean_square_displacement(displacement)
     if scene.surface is not None:
-        energy = 2 * scene.surface.inertia * jnp.mean(gas.particles[..., 2 * d :] ** 2, (1, 2))
+        energy = 2 * scene.surface.inertia * jnp.mean(gas.particles[..., d:-d] ** 2, (1, 2))
         values["rotational_temperature"] = energy * decay.true_spin**2
     tangents = gas.tangents
     if tangents is None:
