@@ -132,7 +132,7 @@ def dsmc_order(options: Options):
             second = round(shared * made.second)
             return made._replace(first=made.first + made.second - second, second=second)
 
-        with mock.patch.object(Scheme, "of", scheme):
+        with mock.patch.object(Scheme, "build", scheme):
             each = cool(gas, times, DSMC(size, replicas=replicas, step=step), seed).replicas
         return mean_and_error(np.log(each.velocity_correlation[:, 0] / gas.temperature))
 
