@@ -15,7 +15,7 @@ import numpy as np
 
 import jaxgran
 from experiments.support.analysis import mean_and_error
-from experiments.support.lammps_library import granular_box, of_pair, temperature
+from experiments.support.lammps_library import granular_box, temperature
 from experiments.support.plots import INK, THEORY, caption, panels
 from experiments.support.record import DATA, Options, run_parts
 from experiments.support.scenes import LAMMPS_CURVES, cool, of_lammps
@@ -73,7 +73,7 @@ def simulate(
         factor = (float(gas.temperature) / temperature(lmp, gas)) ** 0.5
         lmp.commands_list([f"variable v{axis} atom v{axis}*{factor}" for axis in "xyz"])
         lmp.command("velocity all set v_vx v_vy v_vz")
-        lmp.command(f"pair_coeff * * {of_pair(gas)}")
+        lmp.commands_list([*jaxgran.lammps_commands(gas).splitlines(), f"timestep {dt}"])
         found = []
         for more in np.diff(steps, prepend=[0, 0]):
             lmp.command(f"run {more}")

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxgran.data.lammps import contact_law
+import jaxgran
 
 
 def new_lammps() -> Any:
@@ -26,6 +26,8 @@ def new_lammps() -> Any:
 def granular_box(gas, start, skin: float, integrator: str = "nve", replica: int = 0) -> Any:
     """Return a LAMMPS with the spheres of a gas in a box, periodic unless the gas has walls.
 
+    Contacts and the time step are those of `jaxgran.lammps_commands`.
+
     Args:
         gas: contact law, diameter, density, friction and walls.
         start: particles, of which one replica is used.
@@ -41,20 +43,12 @@ def granular_box(gas, start, skin: float, integrator: str = "nve", replica: int 
     n = len(x)
     lmp.create_atoms(n, list(range(1, n + 1)), [1] * n, x.ravel().tolist(), v.ravel().tolist())
     size = [f"set group all diameter {sigma!r}", f"set group all density {float(gas.density)!r}"]
-    contacts = ["pair_style granular", f"pair_coeff * * {of_pair(gas)}"]
+    contacts = jaxgran.lammps_commands(gas).splitlines()
     neighbours = [f"neighbor {skin * sigma!r} bin", "neigh_modify every 1 delay 0 check yes"]
     motion = ["comm_modify vel yes", f"fix move all {integrator}"]
     output = ["thermo_style custom step ke", "thermo 1000000000", "thermo_modify norm no"]
     lmp.commands_list([*size, *contacts, *neighbours, *motion, *output])
-    for axis in "xyz" if gas.container is not None else "":
-        law = contact_law(gas.container.restitution, gas.mass, gas.container)
-        lmp.command(f"fix {axis} all wall/gran granular {law} {axis}plane 0 {side!r}")
     return lmp
-
-
-def of_pair(gas) -> str:
-    """Return the contact law of two spheres of a gas in the words of LAMMPS."""
-    return contact_law(gas.law, gas.mass / 2, gas.surface)
 
 
 def temperature(lmp: Any, gas) -> float:
