@@ -1,6 +1,6 @@
 """Drop tests: normal and tangential restitution of single impacts at known speeds."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -31,6 +31,16 @@ PARTNERS = (SPHERE, PLATE, WALL)
 
 OBLIQUE = ("tangential_speed", "tangential_restitution", "tangential_error")
 """Fields of oblique impacts, which are given together."""
+
+COSINE = Domain(-1, 1, True, True)
+
+OF_SPEEDS = {
+    "speed_error": NON_NEGATIVE,
+    "correlation": COSINE,
+    "tangential_speed_error": NON_NEGATIVE,
+    "tangential_correlation": COSINE,
+}
+"""Domains of the fields that say how well the speeds are known."""
 
 
 def _floats_or_none(value: UserNumber | None) -> Array | None:
@@ -67,6 +77,11 @@ class DropTest(eqx.Module):
             speed before it. None if the speeds are known.
         correlation: of the errors of the speeds before and after, shape (n,), in [-1, 1]; None
             for 0.
+        tangential_speed_error: standard error of each tangential speed, m/s, shape (n,), >= 0,
+            where eps_t is the ratio of two measured velocities; `tangential_error` is then that of
+            the velocity after over the speed before. None if these speeds are known.
+        tangential_correlation: of the errors of the normal and the tangential speed before, shape
+            (n,), in [-1, 1], as the error of an angle makes it; None for 0.
         scatters: whether eps scatters from impact to impact by more than its error, as rough
             surfaces make it; a fit then estimates the standard deviation of this scatter.
 
@@ -91,6 +106,8 @@ class DropTest(eqx.Module):
     speed_error: UserNumber | None = eqx.field(converter=_floats_or_none, default=None)
     correlation: UserNumber | None = eqx.field(converter=_floats_or_none, default=None)
     scatters: bool = eqx.field(static=True, default=False)
+    tangential_speed_error: UserNumber | None = eqx.field(converter=_floats_or_none, default=None)
+    tangential_correlation: UserNumber | None = eqx.field(converter=_floats_or_none, default=None)
 
     advice: ClassVar[dict[str, str]] = {
         "speed": "Give normal speeds in m/s.",
@@ -102,6 +119,9 @@ class DropTest(eqx.Module):
         "before an impact.",
         "tangential_error": "Give the standard error of each eps_t.",
         "speed_error": "Give the standard error of each speed in m/s.",
+        "tangential_speed_error": "Give the standard error of each tangential speed in m/s.",
+        "correlation": "Give none for 0.",
+        "tangential_correlation": "Give none for 0.",
     }
 
     def __check_init__(self):
@@ -114,12 +134,12 @@ class DropTest(eqx.Module):
         positive = ["speed", "error"] + [x for x in given if x != "tangential_restitution"]
         for name in positive:
             POSITIVE.check(name, getattr(self, name), self.advice[name])
-        if self.speed_error is not None:
-            NON_NEGATIVE.check("speed_error", self.speed_error, self.advice["speed_error"])
-        if self.correlation is not None:
-            Domain(-1, 1, True, True).check("correlation", self.correlation, "Give none for 0.")
-        names = ["speed", "restitution", "error", *given]
-        names += [x for x in ("speed_error", "correlation") if getattr(self, x) is not None]
+        domains = {x: domain for x, domain in OF_SPEEDS.items() if getattr(self, x) is not None}
+        if not given and (needless := [x for x in domains if x.startswith("tangential")]):
+            raise ValueError(f"{needless[0]} needs oblique impacts: give {', '.join(OBLIQUE)}, too")
+        for name, domain in domains.items():
+            domain.check(name, getattr(self, name), self.advice[name])
+        names = ["speed", "restitution", "error", *given, *domains]
         shapes = [np.shape(getattr(self, name)) for name in names]
         if len(shapes[0]) != 1 or len(set(shapes)) > 1 or shapes[0] == (0,):
             raise ValueError(
@@ -128,7 +148,8 @@ class DropTest(eqx.Module):
             )
         self._check_range("restitution", self.errors_of_ratio(), 0.0)
         if self.is_oblique:
-            self._check_range("tangential_restitution", np.asarray(self.tangential_error), -1.0)
+            error = np.asarray(self._tangential_error_with(0.0, self.tangential_restitution))
+            self._check_range("tangential_restitution", error, -1.0)
 
     def _check_range(self, name: str, error: np.ndarray, low: float) -> None:
         value = np.asarray(getattr(self, name))
@@ -155,6 +176,13 @@ class DropTest(eqx.Module):
         """Return the standard error of each eps, the error of the speed before included."""
         return np.asarray(self._error_with(np.asarray(self.restitution)))
 
+    def own_errors(self) -> Float[np.ndarray, "values"]:
+        """Return the errors that do not depend on the gas: `error`, then `tangential_error`."""
+        errors = [np.asarray(self.error)]
+        if self.is_oblique:
+            errors.append(np.asarray(self.tangential_error))
+        return np.concatenate(errors)
+
     def _error_with(self, slope: Array | np.ndarray) -> Float[Array, "n"]:
         """Return the error of the speed after minus `slope` times that before, over the latter."""
         error = jnp.asarray(self.error)
@@ -163,6 +191,19 @@ class DropTest(eqx.Module):
         relative = slope * jnp.asarray(self.speed_error) / jnp.asarray(self.speed)
         shared = 0.0 if self.correlation is None else jnp.asarray(self.correlation)
         return jnp.sqrt(error**2 + relative**2 - 2 * shared * error * relative)
+
+    def _tangential_error_with(self, by_normal: Any, by_tangential: Any) -> Float[Array, "n"]:
+        """Return the error of eps_t, by derivatives of the tangential velocity after an impact.
+
+        Args:
+            by_normal, by_tangential: its derivatives in the speeds before.
+        """
+        errors = self.speed_error, self.tangential_speed_error
+        normal, tangential = (0.0 if x is None else jnp.asarray(x) for x in errors)
+        shared = 0.0 if self.tangential_correlation is None else self.tangential_correlation
+        a = by_normal * normal / self.tangential_speed
+        b = by_tangential * tangential / self.tangential_speed
+        return jnp.sqrt(self.tangential_error**2 + a**2 + b**2 + 2 * shared * a * b)
 
     def check_gas(self, gas: Gas) -> None:
         """Raise ValueError for a gas that lacks the elements on which these impacts depend."""
@@ -189,19 +230,19 @@ class DropTest(eqx.Module):
 
     def computed(self, gas: Gas) -> Float[Array, "n"]:
         """Return eps of each impact, for spheres of a gas."""
-        return self._with_slope(gas)[0]
+        return self._eps(gas, jnp.asarray(self.speed))
 
-    def _with_slope(self, gas: Gas) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
-        """Return eps of each impact, and the derivative of the speed after it in that before."""
+    def _eps(self, gas: Gas, speed: Array) -> Float[Array, "n"]:
         law = gas.container.restitution if self.onto == WALL and gas.container else gas.law
         reduced = law.reduced if self.onto == SPHERE else law.on_wall
         known = reduced(diameter=gas.diameter, mass=gas.mass, speed=jnp.ones(()))
-        v = jnp.asarray(self.speed)
-        eps, change = jax.jvp(known.restitution, (v,), (jnp.ones_like(v),))
-        return eps, eps + v * change
+        return known.restitution(speed)
 
     def computed_tangential(self, gas: Gas) -> Float[Array, "n"]:
         """Return eps_t of each oblique impact, for rough spheres of a gas."""
+        return self._eps_t(gas, jnp.asarray(self.speed), jnp.asarray(self.tangential_speed))
+
+    def _eps_t(self, gas: Gas, speed: Array, tangential_speed: Array) -> Float[Array, "n"]:
         surface = gas.surface
         assert isinstance(surface, Rough)
         beta = surface.tangential_restitution
@@ -209,24 +250,48 @@ class DropTest(eqx.Module):
             assert gas.container is not None and gas.container.tangential_restitution is not None
             beta = gas.container.tangential_restitution
         q = surface.inertia
-        steepness = jnp.asarray(self.speed) / jnp.asarray(self.tangential_speed)
+        steepness = speed / tangential_speed
         change = jnp.broadcast_to(1 + beta, steepness.shape)
         if surface.friction is not None:
-            sliding = (1 + 1 / q) * surface.friction * (1 + self.computed(gas)) * steepness
+            sliding = (1 + 1 / q) * surface.friction * (1 + self._eps(gas, speed)) * steepness
             change = jnp.minimum(change, sliding)
         return 1 - change * (q / (1 + q) if self.of_centres else 1.0)
 
-    def errors(self, gas: Gas) -> Float[Array, "n"]:
-        """Return the standard error of eps minus that computed at the measured speed."""
-        return self._error_with(self._with_slope(gas)[1])
+    def errors(self, gas: Gas) -> Float[Array, "values"]:
+        """Return the standard errors of measured minus computed restitution, as `residuals`.
 
-    def residuals(self, gas: Gas) -> Float[Array, "values"]:
-        """Return measured minus computed restitution over the error, for spheres of a gas.
+        The errors of the speeds before an impact change the measured ratios and the computed ones.
+        """
+        v = jnp.asarray(self.speed)
+        one = jnp.ones_like(v)
+        _, slope = jax.jvp(lambda v: v * self._eps(gas, v), (v,), (one,))
+        normal = self._error_with(slope)
+        if not self.is_oblique:
+            return normal
+        speeds = v, jnp.asarray(self.tangential_speed)
+
+        def after(v: Array, v_t: Array) -> Array:
+            return v_t * self._eps_t(gas, v, v_t)
+
+        _, by_normal = jax.jvp(after, speeds, (one, jnp.zeros_like(v)))
+        _, by_tangential = jax.jvp(after, speeds, (jnp.zeros_like(v), one))
+        return jnp.concatenate([normal, self._tangential_error_with(by_normal, by_tangential)])
+
+    def differences(self, gas: Gas) -> Float[Array, "values"]:
+        """Return measured minus computed restitution, for spheres of a gas.
 
         The values of eps come first, then eps_t.
         """
-        normal = (jnp.asarray(self.restitution) - self.computed(gas)) / self.errors(gas)
+        normal = jnp.asarray(self.restitution) - self.computed(gas)
         if not self.is_oblique:
             return normal
-        difference = jnp.asarray(self.tangential_restitution) - self.computed_tangential(gas)
-        return jnp.concatenate([normal, difference / jnp.asarray(self.tangential_error)])
+        tangential = jnp.asarray(self.tangential_restitution) - self.computed_tangential(gas)
+        return jnp.concatenate([normal, tangential])
+
+    def differences_and_errors(self, gas: Gas) -> Float[Array, "2 values"]:
+        """Return the differences and their errors."""
+        return jnp.stack([self.differences(gas), self.errors(gas)])
+
+    def residuals(self, gas: Gas) -> Float[Array, "values"]:
+        """Return the differences over their errors."""
+        return self.differences(gas) / self.errors(gas)

@@ -25,7 +25,7 @@ SPINS_AFTER = tuple(f"{name}_after" for name in SPINS)
 
 
 EPS_RANGE = (0.0, 1.2)
-"""Allowed eps of a file; beyond 1 it is also compared with its error."""
+"""Allowed eps, and |eps_t|, of a file; beyond 1 it is also compared with its error."""
 
 MAX_TILT = 0.01
 """Largest difference of the length of a normal from 1."""
@@ -83,18 +83,17 @@ def _columns_of_restitution(names: list[str]) -> tuple[tuple[str, ...], tuple[st
             "eps_t and eps_t_center are two definitions of the tangential restitution: keep one, "
             "of the surfaces at contact or of the centres"
         )
-    further = ("v_n_err",) if "v_n" in names else ("v_err",)
     tangential = OF_CENTRES if "eps_t_center" in names else OF_SURFACES
     if not {"v_n", "v_t"}.isdisjoint(names):
-        return ("v_n", "v_t", *RESTITUTION, *tangential), further
+        return ("v_n", "v_t", *RESTITUTION, *tangential), ("v_n_err", "v_t_err")
     if "angle" in names:
-        return ("v", "angle", *RESTITUTION, *tangential), further
+        return ("v", "angle", *RESTITUTION, *tangential), ("v_err", "angle_err")
     if both:
         raise ValueError(
             f"the columns have {both.pop()} without the tangential speed: give v_n,v_t, or v,angle "
             "with the angle from the normal in degrees"
         )
-    return ("v", *RESTITUTION), further
+    return ("v", *RESTITUTION), ("v_err",)
 
 
 def _columns_of_velocities(names: list[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -121,8 +120,10 @@ def drop_test_of_table(table: Table) -> tuple[DropTest, list[str]]:
             along u_t, over |u_t|. The header has ``diameter`` where there are spins. Without
             spins, and with the header line ``spin_before: 0``, the velocities of the centres give
             eps_t_center; spheres that rotate before the impact need their spins. The standard
-            error of a component of velocity is v_err, of angular velocity w_err. The header line
-            ``eps_scatters: yes`` says that eps differs from impact to impact by more than its
+            error of a component of velocity is v_err, of angular velocity w_err. Speeds and angles
+            have the errors v_err, v_n_err, v_t_err and angle_err where they were measured, too:
+            then eps_err and eps_t_err are those of the velocity after over that before. The header
+            line ``eps_scatters: yes`` says that eps differs from impact to impact by more than its
             errors (`DropTest.scatters`).
 
     Raises:
@@ -139,38 +140,56 @@ def drop_test_of_table(table: Table) -> tuple[DropTest, list[str]]:
         test = _of_velocities(table, onto)
         return dataclasses.replace(test, scatters=scatters == "yes"), []
     _check_column(table, "eps", *EPS_RANGE, "It is the normal speed after over that before.")
-    speed = columns["v_n"] if "v_n" in columns else columns["v"]
-    name = "v_n" if "v_n" in columns else "v"
-    speed_error = columns.get(f"{name}_err")
-    oblique = {}
-    questions: list[str] = []
     if "angle" in columns:
-        advice = "It is from the normal, in degrees: a grazing impact has nearly 90."
-        _check_column(table, "angle", 0.0, 90.0, advice, ends=False)
-        angle = np.deg2rad(columns["angle"])
-        oblique["tangential_speed"] = speed * np.sin(angle)
-        speed = speed * np.cos(angle)
-        speed_error = None if speed_error is None else speed_error * np.cos(angle)
-    elif "v_t" in columns:
-        oblique["tangential_speed"] = columns["v_t"]
-    if oblique:
+        speeds = _speeds_of_angles(table)
+    else:
+        name = "v_n" if "v_n" in columns else "v"
+        speeds = {"speed": columns[name], "speed_error": columns.get(f"{name}_err")}
+    if "v_t" in columns:
+        speeds["tangential_speed"] = columns["v_t"]
+        speeds["tangential_speed_error"] = columns.get("v_t_err")
+    questions: list[str] = []
+    if "tangential_speed" in speeds:
         value, error = OF_CENTRES if "eps_t_center" in columns else OF_SURFACES
-        oblique["tangential_restitution"] = columns[value]
-        oblique["tangential_error"] = columns[error]
-        limit = 1 + np.max(columns[error])
+        speeds["tangential_restitution"] = columns[value]
+        speeds["tangential_error"] = columns[error]
+        limit = max(EPS_RANGE[1], 1 + np.max(columns[error]))
         _check_column(table, value, -limit, limit, "It is the velocity after over that before.")
-        questions += _ask_about_sign(value, columns[value], oblique["tangential_speed"] / speed)
+        obliqueness = speeds["tangential_speed"] / speeds["speed"]
+        questions += _ask_about_sign(value, columns[value], obliqueness)
     test = DropTest(
-        speed,
-        columns["eps"],
-        columns["eps_err"],
-        onto,
+        restitution=columns["eps"],
+        error=columns["eps_err"],
+        onto=onto,
         of_centres="eps_t_center" in columns,
-        speed_error=speed_error,
         scatters=scatters == "yes",
-        **oblique,
+        **speeds,
     )
     return test, questions
+
+
+def _speeds_of_angles(table: Table) -> dict[str, np.ndarray | None]:
+    """Return normal and tangential speeds of a table of speeds and angles, with their errors."""
+    columns = table.columns
+    advice = "It is from the normal, in degrees: a grazing impact has nearly 90."
+    _check_column(table, "angle", 0.0, 90.0, advice, ends=False)
+    angle = np.deg2rad(columns["angle"])
+    normal = columns["v"] * np.cos(angle)
+    tangential = columns["v"] * np.sin(angle)
+    speeds = {"speed": normal, "tangential_speed": tangential}
+    if {"v_err", "angle_err"}.isdisjoint(columns):
+        return speeds
+    relative = columns.get("v_err", np.zeros_like(angle)) / columns["v"]
+    turn = np.deg2rad(columns.get("angle_err", np.zeros_like(angle)))
+    normal_error = np.hypot(normal * relative, tangential * turn)
+    tangential_error = np.hypot(tangential * relative, normal * turn)
+    product = normal_error * tangential_error
+    covariance = normal * tangential * (relative**2 - turn**2)
+    return speeds | {
+        "speed_error": normal_error,
+        "tangential_speed_error": tangential_error,
+        "tangential_correlation": covariance / np.where(product > 0, product, 1.0),
+    }
 
 
 def _check_column(
@@ -260,7 +279,8 @@ def _of_velocities(table: Table, onto: str) -> DropTest:
         onto,
         tangential,
         eps_t,
-        error_of_surface * np.hypot(1.0, eps_t) / np.where(tangential > 0, tangential, 1.0),
+        error_of_surface / np.where(tangential > 0, tangential, 1.0),
         of_centres=not has_spins,
         speed_error=error,
+        tangential_speed_error=error_of_surface,
     )

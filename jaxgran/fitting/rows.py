@@ -245,22 +245,25 @@ class DropRows:
         assert isinstance(self.measurement.data, DropTest)
         return self.measurement.data
 
-    def scatter_of_eps(self, values: dict[str, Any], residuals: np.ndarray) -> float:
+    def scatter_of_eps(
+        self, values: dict[str, Any], residuals: np.ndarray, errors: np.ndarray
+    ) -> float:
         """Return the standard deviation of eps from impact to impact.
 
         Args:
             values: parameters of the gas, by name; "spread" is the scatter of eps. Without it the
                 most likely scatter is taken where eps scatters (`DropTest.scatters`).
             residuals: measured minus computed values, over their errors.
+            errors: of these values, those of eps first.
         """
         if "spread" in values:
             return float(values["spread"])
         if not self.data.scatters:
             return 0.0
-        errors = self._errors(values)
-        return most_likely_scatter(residuals[: errors.size], errors)
+        number = np.size(self.data.restitution)
+        return most_likely_scatter(residuals[:number], errors[:number])
 
-    def widening(self, values: dict[str, Any], scatter: float) -> np.ndarray:
+    def widening(self, values: dict[str, Any], scatter: float, errors: np.ndarray) -> np.ndarray:
         """Return the factor by which the scatter of eps widens each error.
 
         A scatter that is found from few impacts widens them more, see `few_values_factor`.
@@ -268,16 +271,14 @@ class DropRows:
         Args:
             values: see `scatter_of_eps`.
             scatter: the standard deviation.
+            errors: see `scatter_of_eps`.
         """
         factors = np.ones(self.data.num_values)
         if scatter > 0:
-            errors = self._errors(values)
-            few = 1.0 if "spread" in values else few_values_factor(errors.size)
-            factors[: errors.size] = np.hypot(1.0, few * scatter / errors)
+            number = np.size(self.data.restitution)
+            few = 1.0 if "spread" in values else few_values_factor(number)
+            factors[:number] = np.hypot(1.0, few * scatter / errors[:number])
         return factors
-
-    def _errors(self, values: dict[str, Any]) -> np.ndarray:
-        return np.asarray(self.data.errors(with_parameters(self.gas, values)))
 
     @property
     def num_points(self) -> int:

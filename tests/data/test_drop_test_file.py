@@ -53,6 +53,26 @@ def test_each_kind_of_columns_gives_the_same_impacts(drops_of):
     np.testing.assert_allclose(centres.speed_error, 0.01)
 
 
+def test_errors_of_speeds_and_angles_are_those_of_both_components(drops_of):
+    test = drops_of("v_n,v_t,v_t_err,eps,eps_err,eps_t,eps_t_err\n.3,.4,.02,.9,.01,.2,.02\n")
+    assert test.speed_error is None
+    np.testing.assert_allclose(test.tangential_speed_error, 0.02)
+    # The spheres slide where mu = .01: 1 - eps_t is proportional to v_n/v_t.
+    sliding = ROUGH.replace(friction=0.01)
+    np.testing.assert_allclose(test.errors(sliding)[1], np.hypot(0.02, 0.02 / 0.4))
+    sticking = ROUGH.replace(friction=1e6)
+    np.testing.assert_allclose(test.errors(sticking)[1], np.hypot(0.02, 0.3 * 0.02 / 0.4))
+    tilted = "v,angle,eps,eps_err,eps_t,eps_t_err,angle_err{}\n.5,60,.9,.01,.2,.02,2{}\n"
+    test = drops_of(tilted.format("", ""))
+    np.testing.assert_allclose(test.speed_error, 0.5 * np.sin(np.pi / 3) * np.radians(2))
+    np.testing.assert_allclose(test.tangential_speed_error, 0.5 * 0.5 * np.radians(2))
+    np.testing.assert_allclose(test.tangential_correlation, -1)
+    both = drops_of(tilted.format(",v_err", ",.01"))
+    variance = np.square(test.speed_error) + (0.01 * 0.5) ** 2
+    np.testing.assert_allclose(np.square(both.speed_error), variance)
+    assert np.all(np.asarray(both.tangential_correlation) > -1)
+
+
 def test_a_header_line_says_that_eps_scatters(drops_of):
     for text in (
         "v,eps,eps_err\n.1,.9,.1\n",
@@ -114,7 +134,7 @@ OBLIQUE = "v_n,v_t,eps,eps_err,eps_t,eps_t_err\n"
             "v,angle,eps,eps_err,eps_t,eps_t_err\n.1,95,.9,.1,.2,.1\n",
             "line 2: angle is 95, allowed are 0 to 90. It is from the normal, in degrees",
         ),
-        (OBLIQUE + ".1,.1,.9,.1,1.5,.1\n", "line 2: eps_t is 1.5, .* -1.1 to 1.1"),
+        (OBLIQUE + ".1,.1,.9,.1,1.5,.1\n", "line 2: eps_t is 1.5, .* -1.2 to 1.2"),
         (OBLIQUE + ".1,0,.9,.1,.5,.1\n", "tangential_speed must lie in .* normal impacts are"),
         ("v_n,v_t,eps,eps_err,beta_t\n", "column beta_t .*write eps_t"),
         (
@@ -161,6 +181,8 @@ def test_impacts_need_the_elements_on_which_they_depend():
         jaxgran.Measurement(smooth, jaxgran.DropTest([0.1], [0.9], [0.01], "wall"))
     with pytest.raises(ValueError, match="onto .*sphere, plate, wall, got True"):
         jaxgran.DropTest([0.1], [0.9], [0.01], True)
+    with pytest.raises(ValueError, match="tangential_speed_error needs oblique impacts: give tang"):
+        jaxgran.DropTest([0.1], [0.9], [0.01], tangential_speed_error=[0.1])
     with pytest.raises(ValueError, match="together, got tangential_speed"):
         jaxgran.DropTest([0.1], [0.9], [0.01], tangential_speed=[0.1])
     wall = jaxgran.DropTest([0.1], [0.9], [0.01], "wall")

@@ -38,6 +38,50 @@ def of(gas, test):
     return jaxgran.Measurement(gas, test)
 
 
+def with_errors_of_v_t(test, rng):
+    """Speeds as measured: v_t within 5 %."""
+    v_t = np.asarray(test.tangential_speed)
+    found = v_t * (1 + 0.05 * rng.standard_normal(v_t.size))
+    eps_t = np.asarray(test.tangential_restitution) * v_t / found
+    return dataclasses.replace(
+        test,
+        tangential_speed=found,
+        tangential_restitution=eps_t,
+        tangential_speed_error=0.05 * v_t,
+    )
+
+
+def with_errors_of_angles(test, rng):
+    """Speeds as measured: the angle from the normal within 2 degrees."""
+    v, v_t = np.asarray(test.speed), np.asarray(test.tangential_speed)
+    error = np.radians(2)
+    angle = np.arctan2(v_t, v) + error * rng.standard_normal(v.size)
+    found, found_t = np.hypot(v, v_t) * (np.cos(angle), np.sin(angle))
+    return dataclasses.replace(
+        test,
+        speed=found,
+        restitution=np.asarray(test.restitution) * v / found,
+        tangential_speed=found_t,
+        tangential_restitution=np.asarray(test.tangential_restitution) * v_t / found_t,
+        speed_error=error * found_t,
+        tangential_speed_error=error * found,
+        tangential_correlation=np.full(v.size, -1.0),
+    )
+
+
+@pytest.mark.minutes
+@pytest.mark.parametrize("measured", [with_errors_of_v_t, with_errors_of_angles])
+def test_errors_of_speeds_and_angles_are_in_the_error_bars(measured):
+    off = []
+    for seed in range(40):
+        test = measured(impacts(ROUGH, seed), np.random.default_rng(1000 + seed))
+        result = jaxgran.fit(of(GUESS, test), free=NAMES, quick=True)
+        off.append((result.estimate - TRUE) / result.standard_error)
+    held = np.sum(np.abs(off) < 1.96, axis=0)
+    assert np.all(held >= 0.88 * 40), held
+    assert np.all(np.abs(np.mean(off, axis=0)) < 0.5), np.mean(off, axis=0)
+
+
 @pytest.mark.parametrize("onto, of_centres", [("sphere", False), ("plate", True)])
 def test_oblique_impacts_give_all_three_constants(onto, of_centres):
     test = impacts(ROUGH, 1, onto=onto, of_centres=of_centres)
