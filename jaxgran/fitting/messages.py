@@ -30,6 +30,9 @@ MAX_RATIO = 3.0
 UNBOUNDED = 1e3
 """The same of the high end to the estimate, above which the range has no high end."""
 
+DECISIVE_WEIGHT = 0.8
+"""Weight in a parameter from which on impacts, or curves, are said to determine it."""
+
 MIN_PARTICLES = 50
 """Particles of a model from which on the noise of its curves is known."""
 
@@ -54,19 +57,18 @@ MESSAGES = {
     "narrowing": "if there is no {effects}, {range}: declare `absent: {names}`, or give {given}",
     # the verdict
     "not converged": "The search did not converge: do not trust its estimates.",
-    "not consistent": "{Model} {be} not consistent with this curve: do not trust the estimates."
+    "not consistent": "{Model} {be} not consistent with {data}: do not trust the estimates."
     "{preferred} {remedy}",
     "preferred": "The data prefer a model with {name}",
     "preferred value": "The data prefer a model with {name}, in which {symbol} = {estimate:.3g} "
     "{unit}",
-    "not trusted": "{Model} cannot be trusted in this scene, though the curve fits. {remedy}",
-    "determined": "{Model} {be} consistent with this curve, which determines {symbol}: {range}."
-    "{edge}",
-    "not determined": "{Model} {be} consistent with this curve, which does not determine {symbol}: "
+    "not trusted": "{Model} cannot be trusted in this scene, though {data} {fit}. {remedy}",
+    "determined": "{Model} {be} consistent with {data}, {determine} {symbol}: {range}.{edge}",
+    "not determined": "{Model} {be} consistent with {data}, which {do} not determine {symbol}: "
     "{why}.{edge}",
     "edge": " The scene is at the edge of the model's validity.",
-    "other minima": "other parameters fit this curve as well",
-    "no group": "this curve does not determine {names}",
+    "other minima": "other parameters fit {data} as well",
+    "no group": "{data} {do} not determine {names}",
     "not compared": "alternatives were not compared",
     "possible": "{name} cannot be excluded, and {range}",
     # reasons
@@ -108,12 +110,12 @@ MESSAGES = {
     "standard error",
     "few particles": "{number} particles are too few for their noise to be known, and cool faster "
     "than a gas: give the model {least} or more",
-    "undetermined": "this curve does not determine {names}: {why}; free fewer parameters",
+    "undetermined": "{data} {do} not determine {names}: {why}; free fewer parameters",
     "weak": "it hardly depends on this parameter",
     "combination": "it depends only on a combination of them",
     "forgets": " (a cooling gas forgets its initial temperature)",
     "A and Y": " (in a gas of hard spheres A and Y enter only as A Y^(2/5))",
-    "another minimum": "-2 ln L has another, equally good minimum at {places}: this curve does not "
+    "another minimum": "-2 ln L has another, equally good minimum at {places}: {data} {do} not "
     "distinguish them",
     "slopes": "the derivatives through particles err by an estimated {share:.2g} %, which the "
     "standard error includes: more replicas, or differences=0.3 where the gas has a flow, reduce "
@@ -262,7 +264,8 @@ def _verdict(result: Fit, is_misfit: bool, limitations: tuple[Limitation, ...]) 
         "remedy": " ".join(limitation.remedy for limitation in limitations[:1]),
         "edge": say_edge(limitations),
         "symbol": symbol_of(result.names[0]),
-    }
+        "determine": _who_determines(result),
+    } | _data_of(result)
     preferred = [alternative for alternative in result.alternatives if alternative.preferred]
     if not result.converged:
         return NOT_CONSISTENT, say("not converged")
@@ -274,9 +277,9 @@ def _verdict(result: Fit, is_misfit: bool, limitations: tuple[Limitation, ...]) 
     possible = [a.name for a in result.alternatives if not a.distinguishable]
     group = result.undetermined
     if len(result.other_minima):
-        why = say("other minima")
+        why = say("other minima", **words)
     elif result.names[0] in group:
-        why = say("no group", names=" and ".join(map(symbol_of, group)))
+        why = say("no group", names=" and ".join(map(symbol_of, group)), **words)
     elif not result.ranges:
         why = say("not compared")
     else:
@@ -286,6 +289,31 @@ def _verdict(result: Fit, is_misfit: bool, limitations: tuple[Limitation, ...]) 
             return DETERMINED, say("determined", range=span, **words)
         why = say("possible", name=possible[0], range=span) if possible else span
     return NOT_DETERMINED, say("not determined", why=why, **words)
+
+
+def _data_of(result: Fit) -> dict[str, str]:
+    """Return words for what was fitted, with the verbs that agree with it."""
+    are_drops = [isinstance(m.data, DropTest) for m in result.measurements.values()]
+    if are_drops == [False]:
+        return {"data": "this curve", "do": "does", "fit": "fits"}
+    data = "these impacts" if all(are_drops) else "these measurements"
+    return {"data": data, "do": "do", "fit": "fit"}
+
+
+def _who_determines(result: Fit) -> str:
+    """Say which measurements determine the first parameter, by their weights."""
+    drops = [x for x, m in result.measurements.items() if isinstance(m.data, DropTest)]
+    curves = [x for x in result.measurements if x not in drops]
+    if not curves:
+        return "which determine"
+    if len(result.measurements) == 1:
+        return "which determines"
+    share = sum(float(result.weights[label][0]) for label in drops)
+    if share > DECISIVE_WEIGHT:
+        return "and the impacts determine"
+    if drops and share < 1 - DECISIVE_WEIGHT:
+        return "and the curves determine" if len(curves) > 1 else "and the curve determines"
+    return "which together determine"
 
 
 def _preferred(result: Fit, best: Alternative) -> str:
@@ -405,9 +433,10 @@ def describe_search(result: Fit) -> Iterator[str]:
             why += MESSAGES["forgets"]
         elif {"dissipative_constant", "youngs_modulus"} <= {*group}:
             why += MESSAGES["A and Y"]
-        yield say("undetermined", names=" and ".join(map(symbol_of, group)), why=why)
+        names = " and ".join(map(symbol_of, group))
+        yield say("undetermined", names=names, why=why, **_data_of(result))
     if len(result.other_minima):
         symbols = [symbol_of(name) for name in result.names]
         sets = [zip(symbols, other, strict=False) for other in result.other_minima]
         places = [", ".join(f"{name} = {x:.3g}" for name, x in each) for each in sets]
-        yield say("another minimum", places=" and at ".join(places))
+        yield say("another minimum", places=" and at ".join(places), **_data_of(result))

@@ -41,6 +41,7 @@ def test_a_drop_test_gives_its_constant(onto_plate):
     assert result.p_value > 0.01 and result.converged
     assert result.weights["one"][0] == pytest.approx(0.5, abs=0.01)
     alone = jaxgran.fit(one)
+    assert "is consistent with these impacts, which determine A: " in alone.verdict
     assert float(alone.standard_error[0]) == pytest.approx(2**0.5 * error, rel=0.05)
     assert alone.grade == "determined"
 
@@ -112,7 +113,9 @@ def test_curves_and_drops_together():
     assert sum(share[0] for share in result.weights.values()) == pytest.approx(1)
     assert in_range(result, dilute.value(A))
     assert not any(x.preferred for x in result.alternatives)
-    assert "though the curve fits" in result.verdict  # contacts of the dense gas last too long
+    assert (
+        "though these measurements fit" in result.verdict
+    )  # contacts of the dense gas last too long
     # Alone each curve knows less.
     for label in curves:
         alone = jaxgran.fit(data[label], free=(A, "temperature"), quick=True)
@@ -123,6 +126,23 @@ def test_curves_and_drops_together():
     contradicted = jaxgran.fit(data, separate=("temperature",))
     assert contradicted.p_value < 1e-4
     assert "is not consistent" in contradicted.verdict
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [(0.1, ", and the impacts determine A: "), (0.01, ", which together determine A: ")],
+)
+def test_the_verdict_says_what_determines_a(error, words):
+    gas = glass_beads(0.15)
+    known = {"errors_measured": True, "num_particles": 10**7, "absent": ("walls", "roughness")}
+    curve = jaxgran.Measurement(
+        gas, synthetic(gas, jax.random.key(3), relative_error=error), **known
+    )
+    drops = of_drops(gas, drop_test(gas, jax.random.key(5)))
+    result = jaxgran.fit({"curve": curve, "drops": drops})
+    assert "is consistent with these measurements" + words in result.verdict
+    assert (result.weights["drops"][0] > 0.8) == ("and the impacts" in words)
 
 
 def test_two_copies_are_one_measurement(write):
