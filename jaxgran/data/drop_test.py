@@ -176,13 +176,6 @@ class DropTest(eqx.Module):
         """Return the standard error of each eps, the error of the speed before included."""
         return np.asarray(self._error_with(np.asarray(self.restitution)))
 
-    def own_errors(self) -> Float[np.ndarray, "values"]:
-        """Return the errors that do not depend on the gas: `error`, then `tangential_error`."""
-        errors = [np.asarray(self.error)]
-        if self.is_oblique:
-            errors.append(np.asarray(self.tangential_error))
-        return np.concatenate(errors)
-
     def _error_with(self, slope: Array | np.ndarray) -> Float[Array, "n"]:
         """Return the error of the speed after minus `slope` times that before, over the latter."""
         error = jnp.asarray(self.error)
@@ -277,21 +270,14 @@ class DropTest(eqx.Module):
         _, by_tangential = jax.jvp(after, speeds, (jnp.zeros_like(v), one))
         return jnp.concatenate([normal, self._tangential_error_with(by_normal, by_tangential)])
 
-    def differences(self, gas: Gas) -> Float[Array, "values"]:
-        """Return measured minus computed restitution, for spheres of a gas.
-
-        The values of eps come first, then eps_t.
-        """
-        normal = jnp.asarray(self.restitution) - self.computed(gas)
-        if not self.is_oblique:
-            return normal
-        tangential = jnp.asarray(self.tangential_restitution) - self.computed_tangential(gas)
-        return jnp.concatenate([normal, tangential])
-
-    def differences_and_errors(self, gas: Gas) -> Float[Array, "2 values"]:
-        """Return the differences and their errors."""
-        return jnp.stack([self.differences(gas), self.errors(gas)])
-
     def residuals(self, gas: Gas) -> Float[Array, "values"]:
-        """Return the differences over their errors."""
-        return self.differences(gas) / self.errors(gas)
+        """Return measured minus computed restitution over the error, for spheres of a gas.
+
+        The values of eps come first, then eps_t. Where speeds have errors the sum of squares is
+        that with the most likely speeds, so that the errors are differentiated, too.
+        """
+        differences = jnp.asarray(self.restitution) - self.computed(gas)
+        if self.is_oblique:
+            tangential = jnp.asarray(self.tangential_restitution) - self.computed_tangential(gas)
+            differences = jnp.concatenate([differences, tangential])
+        return differences / self.errors(gas)

@@ -56,8 +56,7 @@ def information_by_source(
         add(name, positive((less - more) / (2 * SOURCE_STEP)))
     for row in found.rows:
         # What the scatter itself tells is as uncertain as few grains make it.
-        of_variance = "measurement" if row.name == "drop test" else FEW_PARTICLES
-        add(of_variance, 0.5 * row.log_slopes.T @ row.log_slopes)
+        add(FEW_PARTICLES, 0.5 * row.log_slopes.T @ row.log_slopes)
         if row.name == "curve":
             continue
         name = row.name if row.is_prior else "measurement"

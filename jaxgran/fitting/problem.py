@@ -229,11 +229,9 @@ class Problem:
             if isinstance(m, DropRows)
         ]
         for m, found in impacts:
-            add("drop test", m.label, found.residuals, found.slopes, is_prior=False)
-            of_errors = _of_unit_variance(
-                "drop test", m.label, found.log_variance, found.log_slopes, elements, False
-            )
-            rows[-1] = rows[-1]._replace(log_variance=of_errors.values, log_slopes=of_errors.slopes)
+            slopes = {name: x / found.widening[:, None] for name, x in found.slopes.items()}
+            add("drop test", m.label, found.residuals / found.widening, slopes, is_prior=False)
+            rows[-1] = rows[-1]._replace(log_variance=2 * np.log(found.widening))
         scatter = _common_scatter(impacts)
         for m in self.curves:
             own = values[m.label]
@@ -280,37 +278,24 @@ class _ComparedImpacts(NamedTuple):
     """Measured impacts beside the impacts of a gas.
 
     Attributes:
-        residuals: measured minus computed values over their errors, which the scatter of eps
-            widens, shape (values,).
-        slopes: derivatives of the residuals at fixed errors in SI values, by parameter.
-        log_variance: logarithm of the squares of the errors.
-        log_slopes: its derivatives: errors of speeds count by the slopes of the computed values.
+        residuals: measured minus computed values over their errors, shape (values,).
+        slopes: derivatives of the residuals in SI values, by parameter.
         scatter: standard deviation of eps from impact to impact.
+        widening: factor by which this widens each error, shape (values,).
     """
 
     residuals: np.ndarray
     slopes: dict[str, Any]
-    log_variance: np.ndarray
-    log_slopes: dict[str, Any]
     scatter: float
+    widening: np.ndarray
 
 
 def _compared_impacts(m: DropRows, values: dict[str, Any]) -> _ComparedImpacts:
     floats = {name: jnp.asarray(x) for name, x in values.items() if name in m.gas.domains}
-    found, slopes = residuals_and_slopes(m.data.differences_and_errors, m.gas, floats)
-    differences, errors = np.asarray(found)
-    scatter = m.scatter_of_eps(floats, differences / errors, errors)
-    widened = errors * m.widening(floats, scatter, errors)
-    of_differences = {}
-    of_variance = {}
-    for name, slope in slopes.items():
-        first, second = np.split(np.asarray(slope), 2)
-        of_differences[name] = first / widened[:, None]
-        of_variance[name] = 2 * (errors / widened**2)[:, None] * second
-    log_variance = 2 * np.log(widened / m.data.own_errors())
-    return _ComparedImpacts(
-        differences / widened, of_differences, log_variance, of_variance, scatter
-    )
+    residuals, slopes = residuals_and_slopes(m.data.residuals, m.gas, floats)
+    residuals = np.asarray(residuals)
+    scatter = m.scatter_of_eps(floats, residuals)
+    return _ComparedImpacts(residuals, slopes, scatter, m.widening(floats, scatter))
 
 
 def _common_scatter(impacts: list[tuple[DropRows, _ComparedImpacts]]) -> float | None:

@@ -245,25 +245,22 @@ class DropRows:
         assert isinstance(self.measurement.data, DropTest)
         return self.measurement.data
 
-    def scatter_of_eps(
-        self, values: dict[str, Any], residuals: np.ndarray, errors: np.ndarray
-    ) -> float:
+    def scatter_of_eps(self, values: dict[str, Any], residuals: np.ndarray) -> float:
         """Return the standard deviation of eps from impact to impact.
 
         Args:
             values: parameters of the gas, by name; "spread" is the scatter of eps. Without it the
                 most likely scatter is taken where eps scatters (`DropTest.scatters`).
             residuals: measured minus computed values, over their errors.
-            errors: of these values, those of eps first.
         """
         if "spread" in values:
             return float(values["spread"])
         if not self.data.scatters:
             return 0.0
-        number = np.size(self.data.restitution)
-        return most_likely_scatter(residuals[:number], errors[:number])
+        errors = self._errors(values)
+        return most_likely_scatter(residuals[: errors.size], errors)
 
-    def widening(self, values: dict[str, Any], scatter: float, errors: np.ndarray) -> np.ndarray:
+    def widening(self, values: dict[str, Any], scatter: float) -> np.ndarray:
         """Return the factor by which the scatter of eps widens each error.
 
         A scatter that is found from few impacts widens them more, see `few_values_factor`.
@@ -271,14 +268,18 @@ class DropRows:
         Args:
             values: see `scatter_of_eps`.
             scatter: the standard deviation.
-            errors: see `scatter_of_eps`.
         """
         factors = np.ones(self.data.num_values)
         if scatter > 0:
-            number = np.size(self.data.restitution)
-            few = 1.0 if "spread" in values else few_values_factor(number)
-            factors[:number] = np.hypot(1.0, few * scatter / errors[:number])
+            errors = self._errors(values)
+            few = 1.0 if "spread" in values else few_values_factor(errors.size)
+            factors[: errors.size] = np.hypot(1.0, few * scatter / errors)
         return factors
+
+    def _errors(self, values: dict[str, Any]) -> np.ndarray:
+        """Return the errors of eps."""
+        errors = self.data.errors(with_parameters(self.gas, values))
+        return np.asarray(errors)[: np.size(self.data.restitution)]
 
     @property
     def num_points(self) -> int:
