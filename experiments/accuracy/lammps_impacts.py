@@ -111,7 +111,7 @@ def fitted(measurement: jaxgran.Measurement) -> dict:
     """Return A of a run by a fit, its standard error and its range, over the true A."""
     result = fit_quietly(measurement)
     true = float(measurement.gas.value("dissipative_constant"))
-    T = np.asarray(measurement.data.temperature)
+    T = np.asarray(measurement.curve.temperature)
     low, high = (float(end[0]) for end in result.ranges["dissipative_constant"])
     return {
         "fallen_to": float(T[-1] / T[0]),

@@ -194,9 +194,11 @@ class DropTest(eqx.Module):
         errors = self.speed_error, self.tangential_speed_error
         normal, tangential = (0.0 if x is None else jnp.asarray(x) for x in errors)
         shared = 0.0 if self.tangential_correlation is None else self.tangential_correlation
-        a = by_normal * normal / self.tangential_speed
-        b = by_tangential * tangential / self.tangential_speed
-        return jnp.sqrt(self.tangential_error**2 + a**2 + b**2 + 2 * shared * a * b)
+        before = jnp.asarray(self.tangential_speed)
+        a = by_normal * normal / before
+        b = by_tangential * tangential / before
+        own = jnp.asarray(self.tangential_error)
+        return jnp.sqrt(own**2 + a**2 + b**2 + 2 * jnp.asarray(shared) * a * b)
 
     def check_gas(self, gas: Gas) -> None:
         """Raise ValueError for a gas that lacks the elements on which these impacts depend."""

@@ -4,6 +4,7 @@ The names of the columns tell which kind of table it is.
 """
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import scipy  # which imports scipy.stats at its first use
@@ -140,6 +141,7 @@ def drop_test_of_table(table: Table) -> tuple[DropTest, list[str]]:
         test = _of_velocities(table, onto)
         return dataclasses.replace(test, scatters=scatters == "yes"), []
     _check_column(table, "eps", *EPS_RANGE, "It is the normal speed after over that before.")
+    speeds: dict[str, Any]
     if "angle" in columns:
         speeds = _speeds_of_angles(table)
     else:
@@ -168,7 +170,7 @@ def drop_test_of_table(table: Table) -> tuple[DropTest, list[str]]:
     return test, questions
 
 
-def _speeds_of_angles(table: Table) -> dict[str, np.ndarray | None]:
+def _speeds_of_angles(table: Table) -> dict[str, Any]:
     """Return normal and tangential speeds of a table of speeds and angles, with their errors."""
     columns = table.columns
     advice = "It is from the normal, in degrees: a grazing impact has nearly 90."
