@@ -113,7 +113,7 @@ class Calls:
 
     def __call__(self, function, *options, **more):
         program = self.compiled(function, *options, **more)
-        if function is not run._move:
+        if function is not run._advance:
             return program
 
         def call(shared, state):
