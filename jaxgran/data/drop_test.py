@@ -78,8 +78,8 @@ class DropTest(eqx.Module):
         correlation: of the errors of the speeds before and after, shape (n,), in [-1, 1]; None
             for 0.
         tangential_speed_error: standard error of each tangential speed, m/s, shape (n,), >= 0,
-            where eps_t is the ratio of two measured velocities; `tangential_error` is then that of
-            the velocity after over the speed before. None if these speeds are known.
+            where eps_t is the ratio of two measured velocities; `tangential_error` is then the
+            error of the velocity after, over the speed before. None if these speeds are known.
         tangential_correlation: of the errors of the normal and the tangential speed before, shape
             (n,), in [-1, 1], as the error of an angle makes it; None for 0.
         scatters: whether eps scatters from impact to impact by more than its error, as rough

@@ -46,7 +46,7 @@ def read_measurement(
             id,t,x,y and, where measured, z (`jaxgran.data.tracks.curve_of_tracks`).
             Units may stand after a name or a value, as in ``t (ms)`` and ``# diameter: 2 mm``;
             header keys length_unit, time_unit and speed_unit, which holds for T squared, give
-            those of all other columns and of diameter, T0, A and the like; other numbers are in
+            units of all other columns and of diameter, T0, A and the like; other numbers are in
             SI. Commas, semicolons, tabs or blanks separate the columns; between semicolons
             numbers may have decimal commas.
             Trajectories with velocities (GSD, extended XYZ, LAMMPS dump) and npz files that
@@ -56,7 +56,7 @@ def read_measurement(
             `priors_of_header`, N, replicas, absent, tracked, T0_of ("run" or "ensemble"),
             T_scale_err, errors ("measured"), which stand for the arguments of `Measurement`, those
             of drop tests, onto ("sphere", "plate" or "wall"), eps_scatters ("yes") and spin_before
-            ("0"), and those of tracks.
+            ("0"), and the keys of tracks.
         gas: the gas in place of the header's, such as the gas of a curve for a drop test.
 
     Returns:

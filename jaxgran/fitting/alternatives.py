@@ -229,7 +229,7 @@ def _with_free_amplitude(
     values = kind.values_by_label(problem, at_best.amplitude)
     first = [own.pop(name) for own in values.values()]
     domain = domain_of(problem.curves[0].gas, name)
-    # A law of impacts is that of drop tests, too; other elements belong to each curve.
+    # Drop tests have the law of impacts, too; other elements belong to each curve.
     labels = [None] if kind.changes_law else [m.label for m in problem.curves]
     unknowns = [Unknown(name, label, (), domain) for label in labels]
     start = [domain.to_free(x) for x in first[: len(labels)]]

@@ -113,7 +113,7 @@ class Comparison:
         return values.swapaxes(0, 1).reshape(-1, count)
 
     def _temperature_residuals(self, size: int) -> Residuals:
-        """Return the residuals of T, followed by those of T_rot."""
+        """Return the residuals of T, followed by the residuals of T_rot."""
         moving = _elements_that_change_temperatures(self.curve)
         found = self._innovations_at_neighbours([tangent for _, tangent in moving])
         values = found.values

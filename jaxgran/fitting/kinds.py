@@ -93,7 +93,7 @@ class Kind:
         name: in words.
         parameters: the parameters that it adds; the first one identifies the effect.
         amplitudes: values that are tried, in one or two increasing sequences from 0.
-        values: values of parameters at an amplitude, beside a fitted curve; those of a law of
+        values: values of parameters at an amplitude, beside a fitted curve; parameters of a law of
             impacts do not depend on the curve.
         applies: whether it is an alternative in a fit whose measurements may have its parameters.
         rate_error: relative error of kinetic theory's cooling rate by it, at an amplitude.

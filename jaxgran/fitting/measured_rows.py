@@ -160,9 +160,9 @@ def _errors_of_measurement(
 ) -> np.ndarray:
     """Return the standard errors of a measured quantity apart from the fluctuations of N grains.
 
-    The errors of a mean over runs are those of the grains, which the likelihood knows. So are
+    The errors of a mean over runs come from the grains, and the likelihood knows them. So do
     errors of one run that equal ``sqrt(2/(d N))`` of the values, the fluctuation of independent
-    samples of N grains; those of a sample of the grains are computed, too.
+    samples of N grains. The errors of a sample of the grains are computed, too.
     """
     nothing = np.zeros_like(values)
     if given is None:
@@ -246,7 +246,7 @@ def unused_rotation(measurement: Measurement) -> str | None:
 def finite_size_cooling_factor(gas: Gas, num_particles: ArrayLike) -> Float[Array, ""]:
     """Factor by which N particles without total momentum cool faster than many, at the same T.
 
-    Their relative velocities are those of the temperature ``T' = T N/(N-1)``, and each particle
+    Their relative velocities have the temperature ``T' = T N/(N-1)``, and each particle
     collides with N - 1 others: with ``-d ln T/dt = r(T)`` the factor is r(T')/r(T), here with the
     loss ``1 - eps^2`` at the impact speed sqrt(2 T): 1 + .6/N for viscoelastic spheres, 1 + .5/N
     for a constant eps. It is 1 between walls, which take up momentum.

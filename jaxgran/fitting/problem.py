@@ -26,8 +26,8 @@ from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import Gas
 
 MAX_KEPT = 8
-"""Number of evaluations that a problem keeps: that before a rejected step of a search is needed
-again, and so is that of the estimate after the factors of variances have varied."""
+"""Number of evaluations that a problem keeps: a search needs the last one again after a rejected
+step, and an error budget needs the one at the estimate after the factors of variances varied."""
 
 
 class Evaluation(NamedTuple):

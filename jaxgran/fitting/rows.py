@@ -1,4 +1,4 @@
-"""Rows of data that a fit compares with a model: those of measured curves and of drop tests."""
+"""Rows of data that a fit compares with a model: rows of measured curves and of drop tests."""
 
 from dataclasses import dataclass
 from functools import cached_property

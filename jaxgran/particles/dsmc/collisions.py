@@ -105,7 +105,7 @@ MAX_BLOCK = 64
 
 @cache
 def _strides(num_blocks: int) -> np.ndarray:
-    """Return numbers coprime to that of blocks, whose product with it fits into 32 bits."""
+    """Return numbers coprime to `num_blocks` whose product with it fits into 32 bits."""
     top = min(num_blocks, 2**32 // num_blocks - 1)
     return np.array([s for s in range(1, max(top, 2)) if gcd(s, num_blocks) == 1], np.uint32)
 
