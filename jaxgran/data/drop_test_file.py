@@ -124,8 +124,8 @@ def drop_test_of_table(table: Table) -> tuple[DropTest, list[str]]:
             error of a component of velocity is v_err, of angular velocity w_err. Speeds and angles
             have the errors v_err, v_n_err, v_t_err and angle_err where they were measured, too:
             then eps_err and eps_t_err are errors of the velocity after, over the one before. The
-            header line ``eps_scatters: yes`` says that eps differs from impact to impact by more than its
-            errors (`DropTest.scatters`).
+            header line ``eps_scatters: yes`` says that eps differs from impact to impact by more
+            than its errors (`DropTest.scatters`).
 
     Raises:
         ValueError: naming the column and the line of a value out of its range.
