@@ -174,7 +174,8 @@ COOLING = {
     "six decades": (constant(0.8), (THEORY, DSMC(20_000)), DECADES, (0.02, 0.02, 0)),
     # Of rough spheres theory leaves out that spins and velocities are correlated: .7 % of T and
     # 5 % of T_rot/T at N = 1e5, 7 % in a plane; and that walls, which are far more frequent here in
-    # a plane, change a_2: 1.3 % of T. The rest is noise: .8/sqrt(160 000) = .2 % of T, .4 % of the first collisions.
+    # a plane, change a_2: 1.3 % of T. The rest is noise: .8/sqrt(160 000) = .2 % of T, and .4 % of
+    # the first collisions.
     "walls": (replace(glass_beads(), container=WALLS), BEADS, EARLY, (0.024, 0.012, 0)),
     "all": (replace(glass_beads(), **ALL), BEADS, EARLY, (0.024, 0.012, 0.07)),
     "all, 2": (replace(glass_beads(dimension=2), **ALL), BEADS, EARLY, (0.032, 0.02, 0.15)),
