@@ -1,6 +1,6 @@
 """Does an imitation state the coverage that experiments have?
 
-    python experiments/fit/imitations.py [--runs 100] [--rows smooth] [--record] [--out DIR]
+    python experiments/fit/imitations.py [--runs 100] [--rows "smooth|walls"] [--record] [--out DIR]
 
 The scenes of `plan.py`: single runs by hard spheres, with noise of the measurement, each fitted
 with the range over all alternatives. The fit of the first run is imitated (`jaxgran.imitate`). In
@@ -12,10 +12,11 @@ for each
 - strongest: the same with the strongest alternative as the truth, and its name; `alone`:
   imitations of it whose error "assuming no other effect" contains it.
 
-With --rows scenes whose name contains a word are computed again.
+With --rows scenes whose name matches a regular expression are computed again.
 """
 
 import dataclasses
+import re
 import time
 
 import numpy as np
@@ -67,7 +68,7 @@ def imitations(options: Options) -> dict:
     known = figures("imitations", {"scenes": []})["scenes"] if options.rows else []
     scenes = {found["name"]: found for found in known}
     names = [scene.name for scene in (*SCENES, UNTOLD)]
-    asked = [(k, options.runs) for k, name in enumerate(names) if options.rows in name]
+    asked = [(k, options.runs) for k, name in enumerate(names) if re.search(options.rows, name)]
     for found in collected(each_alone(compared, asked)):
         scenes[found["name"]] = found
     found = [scenes[name] for name in names if name in scenes]
