@@ -72,10 +72,8 @@ def imitations(options: Options) -> dict:
     for found in collected(each_alone(compared, asked)):
         scenes[found["name"]] = found
     found = [scenes[name] for name in names if name in scenes]
-    return {
-        "scenes": found,
-        "largest_difference": max(abs(x["held"] - x["imitated"]) for x in found),
-    }
+    differences = [abs(x["held"] - x["imitated"]) / x["runs"] for x in found]
+    return {"scenes": found, "largest_difference": max(differences)}
 
 
 if __name__ == "__main__":
