@@ -113,9 +113,8 @@ def test_curves_and_drops_together():
     assert sum(share[0] for share in result.weights.values()) == pytest.approx(1)
     assert in_range(result, dilute.value(A))
     assert not any(x.preferred for x in result.alternatives)
-    assert (
-        "though these measurements fit" in result.verdict
-    )  # contacts of the dense gas last too long
+    # Contacts of the dense gas last too long.
+    assert "though these measurements fit" in result.verdict
     # Alone each curve knows less.
     for label in curves:
         alone = jaxgran.fit(data[label], free=(A, "temperature"), quick=True)

@@ -96,7 +96,7 @@ class StandIn(jaxgran.KineticTheory):
 
 
 def fitted(model, truth=TRUTH, first=(0.0, 0.0), gas=GAS, **settings):
-    exact = dataclasses.replace(model, noise=0.0)
+    exact = dataclasses.replace(model, noise=0.0) if isinstance(model, StandIn) else None
     curve = synthetic(at(truth, gas), None, 40, ERROR, 1000.0, exact)
     options = {"free": BOTH, "start": at(first, gas), "num_particles": 10**9} | settings
     return fit_measured(gas, curve, model=model, progress=False, **options)
@@ -114,19 +114,29 @@ class Captured(Exception):
     pass
 
 
+@pytest.fixture
+def begun(monkeypatch):
+    """What a fit begins its search with: the simulations, and where it starts."""
+
+    def begin(*args, **settings):
+        captured = []
+
+        def capture(sims, first, max_simulations):
+            captured.append((sims, first))
+            raise Captured
+
+        monkeypatch.setattr(simulated_fit, "by_gauss_newton", capture)
+        with pytest.raises(Captured):
+            fitted(*args, **settings)
+        return captured[0]
+
+    return begin
+
+
 @pytest.mark.slow
-def test_noise_of_slopes_does_not_move_the_answer(monkeypatch):
+def test_noise_of_slopes_does_not_move_the_answer(begun):
     """Runs whose noise grows with A: the noise of a slope is that of the values, times 3."""
-    captured = []
-
-    def capture(sims, first, max_simulations):
-        captured.append((sims, first))
-        raise Captured
-
-    monkeypatch.setattr(simulated_fit, "by_gauss_newton", capture)
-    with pytest.raises(Captured):
-        fitted(StandIn(noise=1e-6), first=TRUTH)
-    ((sims, flat),) = captured
+    sims, flat = begun(StandIn(noise=1e-6), first=TRUTH)
     exact, _ = sims.run(flat, 0)
     rng = np.random.default_rng(0)
     half = exact.values.size // 2  # T_rot is not compared
@@ -144,6 +154,22 @@ def test_noise_of_slopes_does_not_move_the_answer(monkeypatch):
     off = np.array([sims.average([noisy(), noisy()]).flat - flat for _ in range(400)])
     error = off.std(axis=0) / len(off) ** 0.5
     assert np.all(np.abs(off.mean(axis=0)) < 3 * error)
+
+
+@pytest.mark.minutes
+@pytest.mark.slow
+def test_simulations_scatter_as_theory_expects(begun):
+    sims, flat = begun(jaxgran.DSMC(100, replicas=4), (0.0, 0.0), num_particles=10_000)
+    moved, expected = [], []
+    for stream in range(80):
+        simulation, _ = sims.run(flat, stream)
+        average = sims.average([simulation])
+        noise = sims.expected_noise(average.comparison, simulation.slope, average.information, 4)
+        moved.append(average.flat)
+        expected.append(np.diag(noise))
+    ratio = np.var(moved, axis=0, ddof=1) / np.mean(expected, axis=0)
+    # The variance of 80 values is known to 16 %.
+    np.testing.assert_allclose(ratio, 1.0, atol=3 * 0.16)
 
 
 class OneRun(StandIn):
