@@ -72,13 +72,15 @@ def checked_model(model: Any) -> AbstractModel:
 
 
 def checked_key(key: Any) -> PRNGKeyArray | None:
-    """Return the key of random numbers, or None. Raise ValueError for anything else."""
+    """Return the typed key of random numbers, or None. Raise ValueError for anything else."""
     if key is None:
         return key
     if isinstance(key, jax.Array):
         typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0
-        if typed or (key.dtype == jnp.uint32 and key.ndim == 1):
+        if typed:
             return key
+        if key.dtype == jnp.uint32 and key.ndim == 1:
+            return jax.random.wrap_key_data(key)
     raise ValueError(f"key must be a key such as jax.random.key(5), got {key!r:.60}")
 
 

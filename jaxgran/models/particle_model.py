@@ -21,7 +21,7 @@ from jaxgran.models.base import AbstractModel
 from jaxgran.models.members import by_member, together
 from jaxgran.particles import snapshot
 from jaxgran.particles.dynamics import AbstractDynamics
-from jaxgran.particles.elements import transformed_times
+from jaxgran.particles.elements import flight_time
 from jaxgran.particles.run import Recorder, grouped, run_on_host, run_traced, start_traced
 from jaxgran.particles.start import has_other_box, reduced_start
 from jaxgran.scene.gas import Gas
@@ -111,7 +111,7 @@ class AbstractParticleModel(AbstractModel):
         units = self.units(gas)
         reduced = times * units.velocity / units.length
         if self.transforms_time and gas.drag is not None:
-            reduced = transformed_times(scene.drag_rates, reduced)
+            reduced = flight_time(scene.drag_rates.rate, reduced)
         start = reduced_start(self.start, gas, differentiable=not self.projected)
         key = jax.random.key(0) if run.key is None else run.key
         simulated = partial(self._simulated, gas.dimension)

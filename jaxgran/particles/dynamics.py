@@ -25,7 +25,7 @@ class AbstractProcess(eqx.Module):
 
     - `time`, which all replicas have reached;
     - `status`, the faults of all replicas together or of each, see `jaxgran._utils.status`. A
-      replica with a fault does not move any more;
+      state in which all have faults does not move any more;
     - `needed`, where arrays can be too short: rows that each array of `Capacity` would have needed.
 
     Attributes:
@@ -43,7 +43,7 @@ class AbstractProcess(eqx.Module):
 
     @abstractmethod
     def unfinished(self, state: Any, until: ArrayLike) -> Bool[Array, ""]:
-        """Return whether a state is to be moved before it counts as one at a time."""
+        """Return whether a state has still to be moved to reach a time."""
 
     @abstractmethod
     def advance(self, state: Any, until: ArrayLike) -> Any:

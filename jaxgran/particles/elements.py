@@ -1,4 +1,4 @@
-"""Drag, the kicks of a drive, and rough impacts: elements of a scene that all particles share.
+"""Drag, the kicks of a drive, and rough impacts: elements of a scene by particles.
 
 Spins are ``s = (sigma/2) w`` with the angular velocity w: the surface of a sphere moves at the
 speed s.
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.extend.random import threefry_2x32
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, UInt32
+from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, UInt32
 
 from jaxgran.gradients.tangents import ExchangeTangents
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
@@ -53,19 +53,37 @@ def drag_decay(drag: ReducedDrag | None, time: Float[Array, "..."]) -> DragDecay
     return DragDecay(velocity, spin / velocity, spin)
 
 
+SERIES_LIMIT = 0.01
+"""Largest gamma t for which a series is used, which keeps derivatives accurate, also at 0."""
+
+
+def flight_time(rate: ArrayLike, duration: ArrayLike) -> Array:
+    """Return ``(1 - exp(-gamma t))/gamma``, the duration of free flight over the same distance."""
+    z = jnp.asarray(rate * duration)
+    small = jnp.abs(z) < SERIES_LIMIT
+    large = jnp.where(small, 1.0, z)
+    series = jnp.ones_like(z)
+    for k in (6, 5, 4, 3, 2):  # to z^5: the next term is 1e-15
+        series = 1 - z / k * series
+    return jnp.asarray(duration) * jnp.where(small, series, -jnp.expm1(-large) / large)
+
+
 def true_duration(
     drag: ReducedDrag, start: Float[Array, "..."] | float, duration: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    """Return the true duration, >= 0, of a transformed one that begins at a transformed time."""
-    safe = jnp.where(drag.rate > 0, drag.rate, 1.0)
-    share = drag.rate * duration / (1 - drag.rate * start)
-    return jnp.maximum(jnp.where(drag.rate > 0, -jnp.log1p(-share) / safe, duration), 0.0)
+    """Return the true duration, >= 0, of a transformed one that begins at a transformed time.
 
-
-def transformed_times(drag: ReducedDrag, times: Float[Array, "times"]) -> Float[Array, "times"]:
-    """Return the transformed times of true times."""
-    safe = jnp.where(drag.rate > 0, drag.rate, 1.0)
-    return jnp.where(drag.rate > 0, -jnp.expm1(-drag.rate * times) / safe, times)
+    It is the inverse of `flight_time`, at the velocity that drag has left.
+    """
+    scaled = duration / (1 - drag.rate * start)
+    z = drag.rate * scaled
+    small = jnp.abs(z) < SERIES_LIMIT
+    large = jnp.where(small, 0.5, z)
+    series = jnp.full_like(z, 1 / 7)
+    for k in (6, 5, 4, 3, 2, 1):  # to z^6: the next term is 1e-15
+        series = 1 / k + z * series
+    ratio = jnp.where(small, series, -jnp.log1p(-large) / large)
+    return jnp.maximum(scaled * ratio, 0.0)
 
 
 def exchange_slopes(
@@ -119,7 +137,7 @@ MAX_KICK = 0.05
 def kick_variance(
     strength: Array, drag: ReducedDrag | None, start: Array, duration: Array, place: float
 ) -> Array:
-    """Return the growth of T by half of the kicks of a step, at its begin (place 0) or end (1).
+    """Return the growth of T by half of the kicks of a step, at its start (place 0) or end (1).
 
     With drag a kick decays as a velocity does, and the start and the duration are transformed.
     """

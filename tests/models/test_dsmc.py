@@ -288,3 +288,12 @@ def test_a_derivative_in_the_density_is_one_in_the_times():
     _, by_time = jax.jvp(lambda x: temperature(density, x), (1.0,), (1.0,))
     assert np.all(by_time < 0)
     np.testing.assert_allclose(by_density, jax.grad(log_frequency)(density) * by_time, rtol=1e-9)
+
+
+def test_a_raw_key_is_the_typed_one():
+    gas = glass_beads()
+    raw, typed = (
+        jaxgran.cool(gas, [1.0], model=jaxgran.DSMC(100), key=key, progress=False).temperature
+        for key in (jax.random.PRNGKey(3), jax.random.key(3))
+    )
+    np.testing.assert_array_equal(raw, typed)

@@ -12,7 +12,7 @@ from scipy.linalg import hadamard
 
 import jaxgran
 from jaxgran import SoftSpheres
-from jaxgran.particles.soft.forces import flight_time
+from jaxgran.particles.elements import flight_time
 from tests.beads import curves_of, lattice, soft_beads, spheres, total_energy
 
 DATA = Path(__file__).parents[2] / "experiments" / "data"

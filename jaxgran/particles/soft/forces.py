@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxgran.particles.elements import surface_direction, torque
+from jaxgran.particles.elements import flight_time, surface_direction, torque
 from jaxgran.scene.contact import contact_force, midpoint_rate
 from jaxgran.scene.gas import ReducedContact, ReducedFriction, ReducedScene, SphereScene
 
@@ -58,21 +58,6 @@ def block_members(scene: SphereScene, spheres: Spheres, slots: Int[Array, "membe
         return members
     real = (slots < len(spheres.x))[:, None]
     return members._replace(x=jnp.where(real, members.x, 0.5 * scene.container[None]))
-
-
-SERIES_LIMIT = 0.01
-"""Largest gamma t for which `flight_time` uses a series, which keeps derivatives accurate."""
-
-
-def flight_time(rate: ArrayLike, duration: ArrayLike) -> Array:
-    """Return ``(1 - exp(-gamma t))/gamma``, the duration of free flight over the same distance."""
-    z = jnp.asarray(rate * duration)
-    small = jnp.abs(z) < SERIES_LIMIT
-    large = jnp.where(small, 1.0, z)
-    series = jnp.ones_like(z)
-    for k in (6, 5, 4, 3, 2):  # to z^5: the next term is 1e-15
-        series = 1 - z / k * series
-    return jnp.asarray(duration) * jnp.where(small, series, -jnp.expm1(-large) / large)
 
 
 def _column(values: Array) -> Array:
