@@ -9,7 +9,7 @@ are smooth, far from walls and in vacuum unless header lines say otherwise: beta
 T_rot_0 of rough spheres; container_side, wall_restitution, wall_beta_t; gamma of drag. Lines
 eta_err, diameter_err, density_err, Y_err, nu_err, T0_err are standard errors of these values, which
 then enter the error of the estimate. A header line A is not used in the fit; the estimate is
-compared with it. --model auto selects the cheapest model whose estimated error, for the gas that
+compared with it. --model auto selects the fastest model whose estimated error, for the gas that
 kinetic theory fits, is within the tolerance, and gives the reason. Prints a table and one line of
 JSON, and writes a picture and a JSON file.
 """

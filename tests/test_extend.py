@@ -63,7 +63,7 @@ def test_choice():
     off = float(jnp.max(jnp.abs(off - jnp.abs(jnp.log(theory.temperature)))))
     rough = jaxgran.choose_model(gas, times, 0.1, models=models)
     assert isinstance(rough.model, HaffLaw)
-    assert rough.reasons[0].startswith("Haff law: the cheapest model whose estimated error")
+    assert rough.reasons[0].startswith("Haff law: the fastest model whose estimated error")
     assert off < rough.error < 0.1  # a_2 is known, what Enskog's theory leaves out comes on top
     own, better = rough.candidates
     assert own.error == rough.error > better.error

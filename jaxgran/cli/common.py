@@ -59,7 +59,7 @@ class FitOptions:
             nu.
         impacts: Fit single impacts of the tracks of each curve, too.
         onto_plate: The impacts of the drop tests are on a thick plate of the same material.
-        model: Model to use; auto takes the cheapest one whose estimated error is within the
+        model: Model to use; auto takes the fastest one whose estimated error is within the
             tolerance.
         tolerance: Allowed relative error of T for the model auto.
         particles: Number of particles per replica (particle models only; default: N from the

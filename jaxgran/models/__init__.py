@@ -2,7 +2,7 @@
 
 - `cool`: the cooling curve of a gas by any model.
 - `base`: the interface of a model.
-- `kinetic_theory`, `dsmc`, `hard_spheres`, `soft_spheres`: the models, cheapest first;
+- `kinetic_theory`, `dsmc`, `hard_spheres`, `soft_spheres`: the models, fastest first;
   `particle_model` is the base of the last three, and `spheres` of the last two.
 - `linearise`: the program that fits, diagnoses and the choice of a model share.
 - `choose`: choice of a model, by the errors that `error_model` estimates.

@@ -1,4 +1,4 @@
-"""Choice of the cheapest model whose estimated error in a scene is small enough."""
+"""Choice of the fastest model whose estimated error in a scene is small enough."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -26,6 +26,7 @@ from jaxgran.models.error_model import ErrorModel, flow_share
 from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.linearise import curve_of_program
+from jaxgran.models.particle_model import AbstractParticleModel
 from jaxgran.models.scales import scales_at
 from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.scene.gas import Gas
@@ -38,7 +39,7 @@ NUM_TIMES = 64
 
 REASONS = {
     # the first one
-    "chosen": "{name}: the cheapest model whose estimated error of T, {error}, is within "
+    "chosen": "{name}: the fastest model whose estimated error of T, {error}, is within "
     "{tolerance}.",
     "no model": "{name}: the most accurate model, with an estimated error of T of {error}; no "
     "model is within {tolerance}.",
@@ -86,7 +87,7 @@ class Choice(NamedTuple):
     Attributes:
         model: the model, for `jaxgran.cool` or `jaxgran.fit`.
         reasons: the reasons, one sentence each, the verdict first.
-        candidates: all models considered, cheapest first.
+        candidates: all models considered, fastest first.
         error: estimated relative error of T of the chosen model.
 
     >>> choice = jaxgran.choose_model(gas, times, num_particles=200)
@@ -105,7 +106,7 @@ class Choice(NamedTuple):
 
 
 def default_models(num_particles: int, replicas: int = 1) -> tuple[AbstractModel, ...]:
-    """Return the models of this package, cheapest first."""
+    """Return the models of this package, fastest first."""
     kinds = (DSMC, HardSpheres, SoftSpheres)
     return KineticTheory(), *(kind(num_particles, replicas=replicas) for kind in kinds)
 
@@ -119,7 +120,7 @@ def choose_model(
     replicas: int = 1,
     models: Sequence[AbstractModel] | None = None,
 ) -> Choice:
-    """Return the cheapest model whose estimated error of T is within a tolerance.
+    """Return the fastest model whose estimated error of T is within a tolerance.
 
     A model whose cooling rate has a relative error e(t) has a relative error
     ``|d ln T/dt| int_0^t e dt'`` of T. Contributions to e(t) are Enskog's collision frequency,
@@ -134,7 +135,7 @@ def choose_model(
         num_particles: N of the gas, if known: gives the box, and the number of particles of a
             particle model (4000 if unknown). Without it the gas is assumed to stay homogeneous.
         replicas: number of replicas of a particle model.
-        models: the models to choose from, cheapest first; by default all models of this package.
+        models: the models to choose from, fastest first; by default all models of this package.
 
     Returns:
         `Choice`: the model, reasons in words, all candidates with their estimated errors. If no
@@ -148,7 +149,7 @@ def choose_model(
 
     >>> choice = jaxgran.choose_model(gas, times, num_particles=200)
     >>> choice.reasons[0][:43]
-    'Kinetic theory: the cheapest model whose es'
+    'Kinetic theory: the fastest model whose es'
     """
     checked_gas(gas)
     if any_traced(gas, times):
@@ -156,13 +157,15 @@ def choose_model(
             "a model cannot be chosen for values traced by jax.jit, jax.grad or jax.vmap: "
             "call choose_model outside, and pass its model to cool"
         )
-    checked_float("tolerance", tolerance, POSITIVE, "0.02 allows T to err by 2 %.")
-    tolerance = float(tolerance)
+    tolerance = checked_float("tolerance", tolerance, POSITIVE, "0.02 allows T to err by 2 %.")
     if num_particles is not None:
         check_volume(gas, num_particles)
     size = NUM_PARTICLES if num_particles is None else num_particles
     models = default_models(size, replicas) if models is None else models
-    error_model = error_model_of(gas, float(checked_times(times)[-1]), num_particles)
+    if not models:
+        raise ValueError("models must be a sequence of models, or None for all; got none")
+    end = float(checked_times(times)[-1])
+    error_model = error_model_of(gas, end, num_particles)
     candidates = tuple(_candidate(model, error_model) for model in models)
     possible = [(c.error, c) for c in candidates if c.error is not None]
     if not possible:
@@ -172,7 +175,7 @@ def choose_model(
     error, best = good[0] if good else min(possible, key=lambda pair: pair[0])
     reasons = [
         _verdict(best.model, error, tolerance, enough=bool(good)),
-        *_describe_scene(error_model, size, replicas),
+        *_describe_scene(error_model, best.model, *models),
         *(_refused(c.model, c.refusal) for c in candidates if c.refusal),
     ]
     return Choice(best.model, tuple(reasons), candidates, error)
@@ -200,30 +203,32 @@ def _refused(model: AbstractModel, refusal: str) -> str:
 
 
 def error_model_of(gas: Gas, end: float, num_particles: int | None = None) -> ErrorModel:
-    """Build the error model of a gas from t = 0 to `end`, s, by kinetic theory without friction.
+    """Return the error model of a gas from t = 0 to `end`, s, by kinetic theory without friction.
 
     Raises:
         ValueError: for a gas so soft that the softness correction is invalid.
         RuntimeError: if kinetic theory cannot reach the end.
     """
-    mean_free_time = float(scales_at(gas).mean_free_time)
+    scales = scales_at(gas)
+    check_softness_at(gas, 1.0, float(scales.softness))
+    mean_free_time = float(scales.mean_free_time)
     grid = np.linspace(0, np.log1p(end / mean_free_time), NUM_TIMES)
     known = dataclasses.replace(gas, surface=None) if "friction" in gas.elements else gas
     curve = curve_of_program(KineticTheory(), known, np.expm1(grid) * mean_free_time)
+    fault = int(jnp.asarray(curve.status))
+    if fault != status.OK:
+        raise RuntimeError(f"kinetic theory, which estimates the errors: {status.explain(fault)}")
     error_model = error_model_of_curve(gas, curve, num_particles)
     softest = int(np.argmax(error_model.softness))
     hottest = np.exp(error_model.log_temperature[softest] / 2)
     check_softness_at(gas, hottest, float(error_model.softness[softest]))
-    fault = int(jnp.asarray(curve.status))
-    if fault != status.OK:
-        raise RuntimeError(f"kinetic theory, which estimates the errors: {status.explain(fault)}")
     return error_model
 
 
 def error_model_of_curve(
     gas: Gas, curve: CoolingCurve, num_particles: int | None = None
 ) -> ErrorModel:
-    """Build the error model of a gas from its cooling curve, which begins at t = 0.
+    """Return the error model of a gas from its cooling curve, which begins at t = 0.
 
     a_2 and the collisions are set to 0 if the curve does not have them.
     """
@@ -247,7 +252,8 @@ def error_model_of_curve(
     return ErrorModel(gas, num_particles, **values, flow_share=flow, flow_scatter=scatter)
 
 
-def _describe_scene(error_model: ErrorModel, size: int, replicas: int) -> list[str]:
+def _describe_scene(error_model: ErrorModel, *models: AbstractModel) -> list[str]:
+    """Return clauses on a scene, and on the noise of the first model of particles."""
     hard = error_model.error_of_temperature(error_model.instant_contacts)
     corrected = error_model.error_of_temperature(error_model.corrected_contacts)
     lowest, end = np.exp([error_model.log_temperature.min(), error_model.log_temperature[-1]])
@@ -263,8 +269,9 @@ def _describe_scene(error_model: ErrorModel, size: int, replicas: int) -> list[s
             corrected=_percent(corrected),
         ),
         _describe_box(error_model),
-        _describe_noise(error_model, size, replicas),
     ]
+    of_particles = [x for x in models if isinstance(x, AbstractParticleModel)]
+    reasons += [_describe_noise(error_model, x) for x in of_particles[:1]]
     if "friction" in error_model.gas.elements:
         reasons.append(REASONS["friction"])
     return reasons
@@ -289,11 +296,12 @@ def _describe_box(error_model: ErrorModel) -> str:
     )
 
 
-def _describe_noise(error_model: ErrorModel, size: int, replicas: int) -> str:
-    noise = error_model.shot_noise(size * replicas)
-    flowing = error_model.flow_noise(replicas)
+def _describe_noise(error_model: ErrorModel, model: AbstractParticleModel) -> str:
+    number = model.num_particles * model.replicas
+    noise = error_model.shot_noise(number)
+    flowing = error_model.flow_noise(model.replicas)
     return REASONS["noise" if flowing <= noise / 10 else "noise and flow"].format(
-        number=size * replicas, noise=_percent(noise), both=_percent(hypot(noise, flowing))
+        number=number, noise=_percent(noise), both=_percent(hypot(noise, flowing))
     )
 
 

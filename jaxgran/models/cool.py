@@ -49,7 +49,7 @@ def cool(
         gas: the scene; its parameters may be traced, differentiated and batched with `jax.vmap`.
         times: t, s, increasing and >= 0, shape (times,); need not start at 0.
         model: a `jaxgran.extend.AbstractModel`, by default `jaxgran.KineticTheory()`. "auto" uses
-            the cheapest model whose estimated error is small enough; `jaxgran.choose_model` returns
+            the fastest model whose estimated error is small enough; `jaxgran.choose_model` returns
             it with the reasons.
         key: key of the random numbers of a particle model, by default `jax.random.key(0)`: two
             calls without a key return the same numbers. With several CPU devices, or from 8192

@@ -32,7 +32,7 @@ def test_the_curve_of_a_run_of_particles_tells_their_number(scene):
 
 def test_choose_prints_reasons(scene, run):
     status, out, _ = run("choose", "scene.toml", "--until", 10)
-    assert status == 0 and "Kinetic theory: the cheapest model" in out
+    assert status == 0 and "Kinetic theory: the fastest model" in out
 
 
 BAD_INPUT = {

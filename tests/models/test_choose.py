@@ -166,3 +166,21 @@ def test_repr_of_a_curve_and_of_a_choice():
     choice = jaxgran.Choice(jaxgran.KineticTheory(), ("is cheap", "is exact"), (), 0.012)
     assert repr(choice).startswith("Choice: kinetic theory, T within 1.2 %")
     assert all(reason in repr(choice) for reason in choice.reasons)
+
+
+def test_the_noise_is_that_of_the_models_that_were_given():
+    gas = glass_beads()
+    times = over(gas, 10.0)
+    for replicas in (1, 3):
+        choice = jaxgran.choose_model(gas, times, models=[jaxgran.DSMC(500, replicas=replicas)])
+        assert any(f"{500 * replicas} particles have a noise" in x for x in choice.reasons)
+    choice = jaxgran.choose_model(gas, times, models=[jaxgran.KineticTheory()])
+    assert not any("particles have a noise" in x for x in choice.reasons)
+    with pytest.raises(ValueError, match="models must be"):
+        jaxgran.choose_model(gas, times, models=[])
+
+
+def test_a_gas_too_soft_for_theory_is_refused():
+    soft = glass_beads().replace(youngs_modulus=1e-3)
+    with pytest.raises(ValueError, match="overlap by .* at T_0"):
+        jaxgran.choose_model(soft, over(soft, 10.0))
