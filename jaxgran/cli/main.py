@@ -188,9 +188,10 @@ def cool(
     size = next(n for n in (particles, given.size, NUM_PARTICLES) if n is not None)
     chosen = common.models_by_name(default_models(size, replicas))[model]
     curve = jaxgran.cool(given.gas, given.times, model=chosen, key=jax.random.key(key))
-    header = given.header
+    # T is now that of velocities, whatever column it was read from.
+    header = {key: x for key, x in given.header.items() if key not in ("T_from", "T_of")}
     if chosen.stochastic:  # a later fit takes its error budget from them
-        header = header | {"N": str(size), "replicas": str(replicas)}
+        header |= {"N": str(size), "replicas": str(replicas)}
     jaxgran.write_curve(out, curve, header, overwrite=overwrite)
     ratio = float(curve.temperature[-1] / curve.temperature[0])
     title = f"{scene.stem}: {chosen.name}, T falls to {ratio:.3g} of its first value"
@@ -208,7 +209,7 @@ def choose(
     tolerance: float = 0.02,
     no_cache: bool = False,
 ) -> None:
-    """Print the cheapest model that is accurate enough for a scene, and the reasons.
+    """Print the fastest model that is accurate enough for a scene, and the reasons.
 
     Args:
         scene: TOML file with eta, diameter, density, Y, nu, T0 and A (SI), and N for a gas in a

@@ -1,13 +1,15 @@
 """Files of cooling curves and drop tests.
 
 A CSV file holds a measured curve, tracks of particles or a drop test, under header lines that
-describe the gas; an npz file holds every array of a curve. `jaxgran.data.tables` reads the tables.
+describe the gas; an npz file holds every array of a curve. `jaxgran.data.tables` reads the tables,
+and `jaxgran.data.tracks` trajectories.
 """
 
 import io
 import json
 import warnings
 import zipfile
+import zlib
 from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,19 +23,36 @@ from jaxgran.data.curve import QUANTITIES, CoolingCurve, check_values, from_arra
 from jaxgran.data.definitions import BY_COLUMN, TEMPERATURE_COLUMNS
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.drop_test_file import drop_test_columns, drop_test_of_table, is_drop_test
-from jaxgran.data.header import checked_header, gas_or_none
+from jaxgran.data.header import checked_header, gas_or_none, missing_keys
 from jaxgran.data.questions import ask_about_columns, ask_about_speeds, scene_of
-from jaxgran.data.tables import Table, header_entry, header_in_si, read_table
+from jaxgran.data.tables import (
+    Table,
+    header_entry,
+    header_in_si,
+    read_table,
+    text_of_comment,
+)
 
 WANTED = "t,T[,T_err][,msd][,msd_err]"
 """Columns of a file, for messages."""
 
 CSV_FILE = f"a CSV file with the columns {WANTED}"
-OF_ENERGY = "energy: "
-"""Part of the entry T_from of a header where T was computed from a column of energies."""
+"""What is read, for messages."""
 
 ANY_MATERIAL = {"density": "1", "Y": "1", "nu": "0", "T0": "1"}
 """Header keys that the collision frequency over sqrt(T0) does not depend on."""
+
+FIELDS = {quantity.column: name for name, quantity in QUANTITIES.items()}
+"""Fields of a curve by column."""
+
+ARCHIVE_SUFFIX = ".npz"
+"""Suffix of files that hold every array of a curve."""
+
+CSV_SUFFIXES = (".csv", ".txt", ".dat", "")
+"""Suffixes with which a curve is written as text."""
+
+HEADER_ENTRY = "header"
+"""Entry of an npz file that holds the header, as JSON; all others are arrays."""
 
 
 def read_curve(
@@ -95,7 +114,7 @@ def read_data(path: Path, given: dict[str, str]) -> Content:
     """
     if path.suffix == ARCHIVE_SUFFIX:
         curve, header = _read_archive(path)
-        header = header | header_in_si(given)
+        header = header_in_si(header | given)
         return Content(curve, header, list(ask_about_columns(curve, header, gas_or_none(header))))
     if tracks.is_trajectory(path):
         curve, header = tracks.curve_of_trajectory(path, header_in_si(given))
@@ -107,15 +126,15 @@ def read_data(path: Path, given: dict[str, str]) -> Content:
         test, questions = drop_test_of_table(table)
         return Content(test, header, [*ask_about_speeds(columns), *questions])
     if "x" in columns:
-        gas = gas_or_none(ANY_MATERIAL | header)
+        missing = missing_keys(header)
+        gas = gas_or_none(header | {k: x for k, x in ANY_MATERIAL.items() if k in missing})
         curve, questions = tracks.curve_of_tracks(columns, header, table.lines, gas)
         if table.num_left_out:
             questions.append(f"{table.num_left_out} positions that belong to no track are left out")
         questions += ask_about_columns(curve, header, gas_or_none(header))
         return Content(curve, header, questions)
     columns, rounding, column = _with_temperature(table, header)
-    fields = {quantity.column: quantity.field for quantity in QUANTITIES.values()}
-    arrays = {fields[name]: jnp.asarray(x) for name, x in columns.items()}
+    arrays = {FIELDS[name]: jnp.asarray(x) for name, x in columns.items()}
     check_values(arrays, place=lambda i: f"line {table.lines[i]}")
     curve = from_arrays(arrays)
     curve.check_measured()
@@ -130,21 +149,23 @@ def _columns_to_read(names: list[str]) -> list[str]:
     if is_drop_test(names):
         return drop_test_columns(names)
     temperatures = [name for name in ("T", *TEMPERATURE_COLUMNS) if name in names]
-    known = {quantity.column for quantity in QUANTITIES.values()}
-    known |= {end for name in temperatures for end in (name, f"{name}_err")}
+    errors = {f"{name}_err" for name in temperatures}
+    known = {*FIELDS, *temperatures, *errors}
     if "total_energy" in names:  # tables of energies have columns of other energies, too
         names = [name for name in names if name in known]
     unknown = [name for name in names if name not in known]
     missing = ([] if "t" in names else ["t"]) + ([] if temperatures else ["T"])
     if len(temperatures) > 1:
         raise ValueError(f"{' and '.join(temperatures)} each give the temperature; keep one")
+    if len(given := sorted((errors | {"T_err"}) & {*names})) > 1:
+        raise ValueError(f"{' and '.join(given)} each give the error of T; keep one")
     if unknown or missing or len(set(names)) < len(names):
-        measured = [q.column for q in QUANTITIES.values() if q.measured]
+        _, _, *measured = [q.column for q in QUANTITIES.values() if q.measured]  # without t and T
         raise ValueError(
             f"the columns are {', '.join(names)}; "
             + (f"missing: {', '.join(missing)}; " if missing else "")
             + (f"not known: {', '.join(unknown)}; " if unknown else "")
-            + f"name them t,T and, where measured, {', '.join(measured[2:])}, each once. In place "
+            + f"name them t,T and, where measured, {', '.join(measured)}, each once. In place "
             f"of T there may be {', '.join(TEMPERATURE_COLUMNS)}; tracks of particles have the "
             "columns id,t,x,y[,z]"
         )
@@ -156,7 +177,8 @@ def _with_temperature(
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], str]:
     """Return columns with T = <v^2>/d in place of one of `TEMPERATURE_COLUMNS`.
 
-    The velocities are taken for isotropic and Maxwellian. The entry T_from is added to the header.
+    The velocities are taken for isotropic and Maxwellian. The header gets the entry T_from,
+    and T_of if the column holds energies.
 
     Returns:
         The columns, the last digits of T and T_rot by field, and the column that gave T.
@@ -165,14 +187,15 @@ def _with_temperature(
         ValueError: for a speed that is not positive, or an energy of particles of unknown mass.
     """
     columns = dict(table.columns)
-    fields = {"T": "temperature", "T_rot": "rotational_temperature"}
-    rounding = {fields[name]: table.last_digits(name) for name in fields.keys() & columns.keys()}
+    written = [name for name in ("T", "T_rot") if name in columns]
+    rounding = {FIELDS[name]: table.last_digits(name) for name in written}
     name = next((name for name in TEMPERATURE_COLUMNS if name in columns), "T")
     if name == "T":
         return columns, rounding, name
     values = columns.pop(name)
     error = columns.pop(f"{name}_err", None)
-    power = BY_COLUMN[name].power
+    definition = BY_COLUMN[name]
+    power = definition.power
     if power > 1 and np.any(values <= 0):
         i = int(np.argmax(values <= 0))
         raise ValueError(
@@ -187,11 +210,12 @@ def _with_temperature(
         )
     if name == "total_energy" and np.isnan(scene.number):
         raise ValueError("a column of the energy of all particles needs N: add it to the header")
-    factor = BY_COLUMN[name].factor(scene)
+    factor = definition.factor(scene)
     columns["T"] = factor * values**power
-    header["T_from"] = f"T = {factor:.4g} {name}{f'^{power}' * (power > 1)}: it is " + (
-        BY_COLUMN[name].words
-    )
+    formula = name if power == 1 else f"{name}^{power}"
+    header["T_from"] = f"T = {factor:.4g} {formula}: it is {definition.words}"
+    if "energy" in name:
+        header["T_of"] = "energy"
     slope = power * factor * values ** (power - 1)
     rounding["temperature"] = slope * table.last_digits(name)
     if error is not None:
@@ -205,17 +229,19 @@ def write_curve(
     """Write a curve to a file that `read_curve` reads.
 
     A CSV file holds every known quantity at each time, T_err, msd, a2, collisions, energies and so
-    on, with 17 digits, so that it is read back without loss, but neither single replicas nor
-    particles. A file whose name ends in .npz holds everything, bit for bit.
+    on, with 17 digits, so that it is read back without loss; it has three times or more. It holds
+    neither single replicas nor particles, nor what a function `save` of `jaxgran.cool` returned. A
+    file whose name ends in .npz holds everything, bit for bit.
 
     Args:
-        path: the file; its suffix, .npz or another one, chooses the format.
-        curve: of one system; none of its arrays may be traced.
-        header: written as lines ``# key: value``, or unchanged to an .npz file.
+        path: the file; its suffix, .npz or one of .csv, .txt, .dat and none, chooses the format.
+        curve: none of its arrays may be traced. A CSV file holds one system.
+        header: its numbers are converted to SI, in which the columns are.
         overwrite: whether an existing file may be replaced.
 
     Raises:
-        ValueError: if the file exists and `overwrite` is False.
+        ValueError: for another suffix, several curves in a CSV file, an entry that is not one line,
+            a unit that is not one of the key, and if the file exists and `overwrite` is False.
         OSError: naming the path, if it cannot be written; an existing file is then unchanged.
 
     >>> jaxgran.write_curve("all.npz", curve, {"note": "every array"}, overwrite=True)
@@ -223,7 +249,7 @@ def write_curve(
     'every array'
     """
     path = files.checked_path(path, CSV_FILE)
-    header = checked_header(header)
+    header = header_in_si(checked_header(header))
     check_bool(overwrite=overwrite)
     if not isinstance(curve, CoolingCurve):
         raise ValueError(f"curve must be a jaxgran.CoolingCurve, got {curve!r:.60}")
@@ -237,33 +263,31 @@ def write_curve(
     if path.suffix == ARCHIVE_SUFFIX:
         arrays: dict[str, Any] = {name: np.asarray(x) for name, x in to_arrays(curve).items()}
         arrays[HEADER_ENTRY] = np.array(json.dumps(header))
-        return files.write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
-    fields = {q.column: getattr(curve, q.field) for q in QUANTITIES.values()}
-    present = {name: np.asarray(v) for name, v in fields.items() if v is not None}
+        files.write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
+        return
+    curve.check_single()
+    fields = {column: getattr(curve, field) for column, field in FIELDS.items()}
+    present = {column: np.asarray(x) for column, x in fields.items() if x is not None}
     lines = []
     for key, value in header.items():
-        line = f"{key}: {value}"
-        if len(line.splitlines()) > 1 or header_entry(line) != (key, str(value).strip()):
+        line = f"# {key}: {value}"
+        if len(line.splitlines()) > 1 or header_entry(text_of_comment(line)) != (
+            key,
+            value.strip(),
+        ):
             raise ValueError(
-                f"header key {key!r}: key and value must be one line of text each, and the key "
-                "without : and ="
+                f"header key {key!r}: key and value must be one line of text each, the key without "
+                f": and =, and the value must not end in #, a quote or a separator; got {value!r}"
             )
-        lines.append(f"# {line}")
+        lines.append(line)
     lines.append(",".join(present))
     lines += [",".join(f"{x:.17g}" for x in row) for row in zip(*present.values(), strict=True)]
     text = "\n".join(lines) + "\n"
     files.write_atomically(path, lambda f: f.write(text.encode()))
 
 
-ARCHIVE_SUFFIX = ".npz"
-CSV_SUFFIXES = (".csv", ".txt", ".dat", "")
-
-HEADER_ENTRY = "header"
-"""Entry of an npz file that holds the header, as JSON; all others are arrays."""
-
-
 def _check_sizes(content: io.BytesIO) -> None:
-    """Raise ValueError for an array that its entry of an npz file cannot hold, or for too much."""
+    """Raise ValueError for an array larger than its entry of an npz file, or too much in all."""
     with zipfile.ZipFile(content) as archive:
         if sum(entry.file_size for entry in archive.infolist()) > files.MAX_BYTES:
             raise ValueError(f"more than {files.MAX_BYTES:g} bytes unpacked")
@@ -284,9 +308,17 @@ def _read_archive(path: Path) -> tuple[CoolingCurve, dict[str, str]]:
         content.seek(0)
         with np.load(content, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-        header = json.loads(str(arrays.pop(HEADER_ENTRY)))
+        header = checked_header(json.loads(str(arrays.pop(HEADER_ENTRY))))
         return from_arrays({name: jnp.asarray(x) for name, x in arrays.items()}), header
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+    except (
+        OSError,
+        EOFError,
+        ValueError,
+        KeyError,
+        TypeError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
         raise ValueError(
             f"not a file that this version of jaxgran.write_curve wrote ({error}); give such a "
             "file, or a CSV file"

@@ -35,7 +35,7 @@ SIGN_LEVEL = 1e-3
 """Probability by chance of an eps_t that falls with v_t/v_n, below which its sign is asked for."""
 
 MIN_JUDGED = 7
-"""Number of impacts from which on such a fall can be significant: 1/7! by chance."""
+"""Least number of impacts for which such a fall is significant: 1/7! by chance."""
 
 AMBIGUOUS_UNITS = ("", "Hz", "1/s", "s^-1")
 """Units of angular velocities that may be radians or revolutions."""

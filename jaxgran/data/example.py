@@ -1,4 +1,4 @@
-"""Two measured curves that come with the package, for examples and for a first fit."""
+"""Two cooling curves, simulated in LAMMPS, that come with the package for a first fit."""
 
 from pathlib import Path
 

@@ -36,6 +36,7 @@ OPTIONAL_KEYS = (
     "eps_scatters",
     "spin_before",
     "T_from",
+    "T_of",
     *tracks.TRACK_KEYS,
 )
 """Further known header keys, neither of the gas nor of its elements."""
@@ -77,8 +78,8 @@ EXACT_DENSITY_ERROR = 1e-4
 """Relative error of the prior of a density without an error, where the diameter has one."""
 
 _MIXTURE = (
-    "grains of a mixture have a temperature for each kind, and one T is too few; sizes within a "
-    "fifth of their mean have the key diameter_sd"
+    "grains of a mixture have a temperature for each kind, and one T is too few; diameters with a "
+    "standard deviation of at most a fifth of their mean have the key diameter_sd"
 )
 _STICKING = "grains that stick lose all of their speed below some speed, and grow"
 

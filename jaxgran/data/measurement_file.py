@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxgran.data import files
-from jaxgran.data.curve_file import CSV_FILE, OF_ENERGY, read_data
+from jaxgran.data.curve_file import CSV_FILE, read_data
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.header import (
     ANY_GAS,
@@ -99,7 +99,7 @@ def read_measurement(
             ensemble_start=header_choice(entries, "T0_of", ("run", "ensemble")) == "ensemble",
             calibration_error=files.header_number({"T_scale_err": "0"} | entries, "T_scale_err"),
             errors_measured=header_choice(entries, "errors", ("any", "measured")) == "measured",
-            of_energy=OF_ENERGY in entries.get("T_from", ""),
+            of_energy=header_choice(entries, "T_of", ("velocity", "energy")) == "energy",
             rounding=content.rounding,
             guesses=guesses_of_header(entries),
             header=tuple(entries.items()),

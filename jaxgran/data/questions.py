@@ -68,7 +68,7 @@ MAX_ERROR_RATIO = 10.0
 
 QUESTIONS = {
     # units
-    "unusual": "{name} is {value:.6g} {base}, and usual is {low:g} to {high:g}: {question}",
+    "unusual": "{name} is {value:.6g} {base}; usual values are {low:g} to {high:g}: {question}",
     "any unit": "check its unit",
     "any unit of T": "check its unit (kelvin times 1.38e-23 J/K over the mass are m^2/s^2)",
     "unit of a key": "is it in {unit}? Then write {name}: {in_si:.6g}, or {name}: {value:g} {unit}",
@@ -85,17 +85,17 @@ QUESTIONS = {
     "{digit:.2g}/sqrt(12): the rounding counts as an error in addition. Write more digits of "
     "{column}",
     # the start and the loss
-    "late start": "T is T0 = {T0:g} m^2/s^2 at t = {begin:.6g} s and not at 0, by the first rows: "
+    "late start": "by the first rows T is T0 = {T0:g} m^2/s^2 at t = {begin:.6g} s and not at 0: "
     "does the clock of the file start earlier than the gas? Then subtract that time, or fit it: "
     "--free A t0",
     "loss": "T falls to a half in {halving:.3g} mean free times of the header's gas (eta, "
-    "diameter, T0), and usual is .1 to 1e3: {question}",
+    "diameter, T0); usual values are {low:.2g} to {high:.2g}: {question}",
     "unit of t": "is t in {units}? Then name the column t ({unit})",
     "any unit of the header": "are t, eta, diameter and T0 in the units that the file says?",
     "steps": "; is it in steps or frames? Then multiply it by their duration",
     # the definition of T
     "mean_speed": "mean_speed is read as the speed in three dimensions. If it contains only the "
-    "two components that one camera sees, T is .62 times too small and A 37 % too large: name the "
+    "two components that one camera sees, T is 0.62 of the true one and A 37 % too large: name the "
     "column mean_speed_xy then, and mean_speed_xyz otherwise",
     "scale": "T is {first:.4g} at first, {ratio:.3g} times the header's T0 = {T0:g} m^2/s^2: "
     "{question}. If T is right, correct T0",
@@ -263,7 +263,9 @@ def _ask_about_start(
             question = _ask("unit of t", units=" or ".join(units), unit=units[0])
         if loss < 1:
             question += _ask("steps")
-        yield _ask("loss", halving=halving / float(gas.mean_free_time), question=question)
+        halving = halving / float(gas.mean_free_time)
+        high, low = (halving * loss / usual for usual in USUAL_LOSS)
+        yield _ask("loss", halving=halving, low=low, high=high, question=question)
 
 
 @eqx.filter_jit

@@ -55,6 +55,10 @@ HEADER_ALIASES = {"phi": "eta", "packing_fraction": "eta"}
 """Further names of header keys."""
 
 COMMENT_SIGNS = "#%"
+"""Signs at the beginning of header lines and comments."""
+
+BLANKS = ' "\t,;|'
+"""Characters without meaning at both ends of a line."""
 
 ALIASES = {
     "time": "t",
@@ -181,9 +185,9 @@ def read_table(
     first = 0
     text = read_text(path, wanted).replace("\r\n", "\n").replace("\r", "\n")
     for i, line in enumerate(text.split("\n"), start=1):
-        bare = line.strip(' "\t,;|')
+        bare = line.strip(BLANKS)
         if bare[:1] and bare[0] in COMMENT_SIGNS:
-            _add_header_line(header, i, bare.lstrip(COMMENT_SIGNS + " ").rstrip("# "))
+            _add_header_line(header, i, text_of_comment(line))
         elif bare and not names:
             if not re.match(r"[\w\"'.+-]", bare):
                 raise ValueError(
@@ -350,6 +354,11 @@ def _number(text: str, comma: bool) -> float:
     except ValueError:
         plain = _plain_number(text, comma)
         return math.nan if plain == text else float(plain)
+
+
+def text_of_comment(line: str) -> str:
+    """Return a comment without its sign, and without separators and quotes at its ends."""
+    return line.strip(BLANKS).lstrip(COMMENT_SIGNS + " ").rstrip("# ")
 
 
 def header_entry(line: str) -> tuple[str, str] | None:

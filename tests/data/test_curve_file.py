@@ -42,9 +42,9 @@ def test_everything_that_was_computed_is_kept(tmp_path):
     # No field but the status, which says that nothing failed, may be lost.
     for name, value in vars(dataclasses.replace(theory, status=None)).items():
         np.testing.assert_array_equal(getattr(copy, name), value, err_msg=name)
-    jaxgran.write_curve(tmp_path / "theory.npz", theory, {"T0": "1 m"})
+    jaxgran.write_curve(tmp_path / "theory.npz", theory, {"note": "1 m"})
     copy, header = jaxgran.read_curve(tmp_path / "theory.npz")
-    assert header == {"T0": "1 m"} and eqx.tree_equal(copy, theory)
+    assert header == {"note": "1 m"} and eqx.tree_equal(copy, theory)
 
 
 def test_an_archive_of_others_is_refused(tmp_path):
@@ -134,9 +134,20 @@ def test_units_of_the_header(read, tmp_path):
     assert priors_of_header(header)["diameter"] == pytest.approx((2e-3, 2e-5))
     assert float(header["A"]) == pytest.approx(3e-6)
     # What is written is SI, and says so by having no units.
-    jaxgran.write_curve(tmp_path / "copy.csv", curve, header)
-    copy, again = jaxgran.read_curve(tmp_path / "copy.csv")
-    np.testing.assert_array_equal(copy.times, curve.times)
-    assert again == header and "length_unit" not in header
+    given = {
+        "diameter": 2,
+        "diameter_err": 0.02,
+        "T0": "1e-8",
+        "length_unit": "mm",
+        "time_unit": "ms",
+    }
+    for suffix in (".csv", ".npz"):
+        for written in (header, given):
+            jaxgran.write_curve(tmp_path / f"copy{suffix}", curve, written, overwrite=True)
+            copy, again = jaxgran.read_curve(tmp_path / f"copy{suffix}")
+            np.testing.assert_array_equal(copy.times, curve.times)
+            np.testing.assert_array_equal(copy.temperature, curve.temperature)
+            assert "length_unit" not in again
+            assert float(again["diameter"]) == pytest.approx(2e-3)
     _, header = read(f"{IN_MM}{UNITS}# force_unit: N\nt,T\n", TIMES * 1e3, T)
     assert header["force_unit"] == "N"
