@@ -1,5 +1,7 @@
 """What a measurement tells about the unknowns of a fit, and by which cause they err."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from jaxgran.fitting.problem import Evaluation, Problem
@@ -11,7 +13,7 @@ DEGENERATE = 9.0
 """Difference of -2 ln L up to which two minima are equally good: three standard errors."""
 
 UNDETERMINED_ERROR = 1.0
-"""Standard error in the unconstrained scale, a factor e, from which on nothing is known."""
+"""Standard error in the unconstrained scale, a factor e, above which nothing is known."""
 
 SOURCE_STEP = 0.02
 """Relative change of a variance by which its part of an error is found."""
@@ -51,9 +53,9 @@ def information_by_source(
     if any(np.any(np.asarray(m.simulation) > 0) for m in problem.curves):
         sources.append("simulation")
     for name in sources if problem.curves else []:
-        less = linear(problem.evaluate(flat, **{name: 1 - SOURCE_STEP}))
-        more = linear(problem.evaluate(flat, **{name: 1 + SOURCE_STEP}))
-        add(name, positive((less - more) / (2 * SOURCE_STEP)))
+        add(
+            name, decrease_with_variance(lambda x, n=name: linear(problem.evaluate(flat, **{n: x})))
+        )
     for row in found.rows:
         # What the scatter itself tells is as uncertain as few grains make it.
         add(FEW_PARTICLES, 0.5 * row.log_slopes.T @ row.log_slopes)
@@ -62,6 +64,17 @@ def information_by_source(
         name = row.name if row.is_prior else "measurement"
         add(FEW_PARTICLES if name == SCATTER else name, row.slopes.T @ row.slopes)
     return {name: part for name, part in parts.items() if np.any(part)}
+
+
+def decrease_with_variance(information: Callable[[float], np.ndarray]) -> np.ndarray:
+    """Return how much an information decreases with the logarithm of a variance.
+
+    Args:
+        information: as a function of a factor of this variance.
+    """
+    less = information(1 - SOURCE_STEP)
+    more = information(1 + SOURCE_STEP)
+    return positive((less - more) / (2 * SOURCE_STEP))
 
 
 def positive(matrix: np.ndarray) -> np.ndarray:

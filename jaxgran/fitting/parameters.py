@@ -1,6 +1,6 @@
 """Parameters of a fit: their unconstrained scale, initial guesses from the data, and priors.
 
-All of it works on known numbers, arrays of NumPy.
+Guesses and priors are known numbers, arrays of NumPy.
 """
 
 from collections.abc import Callable
@@ -25,9 +25,9 @@ LAW = "law"
 """Name that stands for all parameters of the law of restitution."""
 
 SHARED = ""
-"""Label of the priors of parameters that all measurements share."""
+"""Label of the priors of parameters that all measurements share, and of a single measurement."""
 
-MAX_GUESSES = 24
+NUM_GUESSES = 24
 """Number of values of beta_t, and of mu, that are compared with oblique impacts."""
 
 SMOOTHNESS = "smoothness"
@@ -42,14 +42,13 @@ def domain_of(gas: Gas, name: str) -> Domain:
     """
     if name == START_TIME:
         return Domain()
-    gas.value(name)
+    gas.value(name)  # raises for an unknown name
     return gas.domains[name]
 
 
-def with_names_of_law(names: Any, gas: Gas) -> Any:
+def with_names_of_law(names: tuple[str, ...], gas: Gas) -> tuple[str, ...]:
     """Return names of free parameters, with all parameters of the law in place of `LAW`."""
-    names = (names,) if isinstance(names, str) else names
-    if not isinstance(names, tuple | list) or LAW not in names:
+    if LAW not in names:
         return names
     own = tuple(law_fields(gas.law))
     if not own:
@@ -125,13 +124,13 @@ def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
         free: names of the free parameters.
     """
     times, T = _above_noise(curve)
-    power, line = _power_and_line(gas, curve)
-    scale = T[0]
+    power = power_of_line(gas)
+    line = (T / T[0]) ** -power
     origin = (np.asarray(gas.temperature) / T[0]) ** -power
     values: dict[str, Any] = {}
     if "temperature" in free:
         origin, slope = _intercept_and_slope(times, line)
-        values["temperature"] = scale * origin ** (-1 / power)
+        values["temperature"] = T[0] * origin ** (-1 / power)
     elif START_TIME in free:
         _, slope = _intercept_and_slope(times - times[0], line)
     else:
@@ -140,7 +139,7 @@ def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
     rate = np.maximum(slope / origin, 1e-9 / times[-1])
     values |= _guess_law(with_parameters(gas, as_floats(values)), rate, free)
     values |= _guess_elements(gas, curve, free)
-    return with_parameters(gas, as_floats({name: x for name, x in values.items() if name in free}))
+    return with_parameters(gas, as_floats(values))
 
 
 def guess_from_drops(gas: Gas, test: DropTest, free: tuple[str, ...]) -> dict[str, Any]:
@@ -159,11 +158,13 @@ def guess_from_drops(gas: Gas, test: DropTest, free: tuple[str, ...]) -> dict[st
             law = gas.law.of_wall() if test.onto == PLATE else gas.law
             alpha = law.alpha(diameter=gas.diameter, mass=gas.mass)
             speed = np.median(np.asarray(test.speed))
-            loss = -np.log(eps) / (1.5 * C1 * alpha**0.4 * speed**0.2)
-            values["dissipative_constant"] = loss
+            A = -np.log(eps) / (1.5 * C1 * alpha**0.4 * speed**0.2)
+            values["dissipative_constant"] = A
     if test.is_oblique:
-        of_beta = "wall_" * (test.onto == WALL) + "tangential_restitution"
-        values[of_beta], values["friction"] = _guess_tangential(gas, test)
+        beta_t, friction = _guess_tangential(gas, test)
+        prefix = "wall_" if test.onto == WALL else ""
+        values[f"{prefix}tangential_restitution"] = beta_t
+        values["friction"] = friction
     return {name: x for name, x in values.items() if name in free and name in gas.domains}
 
 
@@ -179,7 +180,7 @@ def _guess_tangential(gas: Gas, test: DropTest) -> tuple[float, float]:
         change = change * (1 + q) / q
     steepness = np.asarray(test.speed) / np.asarray(test.tangential_speed)
     of_unit_friction = (1 + 1 / q) * (1 + np.asarray(test.restitution)) * steepness
-    shares = np.linspace(0, 1, MAX_GUESSES)
+    shares = np.linspace(0, 1, NUM_GUESSES)
     sticking = np.clip(np.quantile(change, shares), 0.02, 1.98)
     friction = np.clip(np.quantile(change / of_unit_friction, shares), 0.01, 10.0)
     sliding = friction[:, None] * of_unit_friction
@@ -190,18 +191,28 @@ def _guess_tangential(gas: Gas, test: DropTest) -> tuple[float, float]:
 
 
 def _guess_law(gas: Gas, rate: Any, free: tuple[str, ...]) -> dict[str, Any]:
-    mean_free_time, alpha, loss_now = map(np.asarray, _law_scales(gas))
-    rate = rate * mean_free_time
-    loss = np.clip(2 * gas.dimension * rate, 1e-6, 0.99)
+    """Return the parameters of a law with which a gas cools as a line of `guess_from_data`.
+
+    Args:
+        gas: the scene.
+        rate: 1/tau_0, the slope of the line over its value at t = 0, 1/s.
+        free: names of the free parameters.
+    """
+    mean_free_time, alpha, drop_now = map(np.asarray, _law_scales(gas))
+    per_collision = rate * mean_free_time
+    # A collision takes the share (1 - eps^2)/d of T.
+    inelasticity = gas.dimension * per_collision / power_of_line(gas)
+    inelasticity = np.clip(inelasticity, 1e-6, 0.99)
     if isinstance(gas.law, ConstantRestitution) and "coefficient" in free:
-        return {"coefficient": np.sqrt(1 - loss)}
+        return {"coefficient": np.sqrt(1 - inelasticity)}
     if isinstance(gas.law, RestitutionSpline) and "drops" in free:
         drops = np.asarray(gas.law.drops)
         drops = np.maximum(drops, 1e-3 * np.max(drops))  # fits vary their logarithms
-        return {"drops": drops * (-np.log1p(-loss) / 2 / loss_now)}
+        return {"drops": drops * (-np.log1p(-inelasticity) / 2 / drop_now)}
     if isinstance(gas.law, Viscoelastic) and "dissipative_constant" in free:
-        delta = rate / COOLING_RATE[gas.dimension]
-        # To the next order in delta the cooling rate goes as delta (1 - q delta / 2): invert it.
+        delta = per_collision / COOLING_RATE[gas.dimension]
+        # At T_0 the cooling rate goes as delta (1 - q delta), and later with smaller delta: half of
+        # the correction stands for the mean. It is inverted.
         correction = 0.5 * COOLING_CORRECTION * delta
         delta = delta / (1 - np.minimum(correction, 0.7))
         T_0 = np.asarray(gas.temperature)
@@ -215,16 +226,16 @@ def _law_scales(gas: Gas) -> tuple[Float[Array, ""], Float[Array, ""], Float[Arr
 
     The typical impact has the root mean square of normal speeds, ``2 sqrt(T)``.
     """
-    alpha = loss = jnp.ones_like(gas.mass)
+    alpha = drop = jnp.ones_like(gas.mass)
     if isinstance(gas.law, Viscoelastic):
         alpha = gas.alpha
     if isinstance(gas.law, RestitutionSpline):
-        loss = -jnp.log1p(-gas.law.loss(2 * jnp.sqrt(gas.temperature)))
-    return gas.mean_free_time, alpha, loss
+        drop = -jnp.log1p(-gas.law.loss(2 * jnp.sqrt(gas.temperature)))
+    return gas.mean_free_time, alpha, drop
 
 
 def known_start_time(priors: dict[str, Priors], label: str) -> tuple[float, float]:
-    """Return the t0 that priors give for a measurement and its error, s, or 0 and infinity."""
+    """Return t0 of a measurement and its error, s, by its priors; (0, inf) without a prior."""
     both = {**priors.get(label, {}), **priors.get(SHARED, {})}
     value, error = both.get(START_TIME, (0.0, np.inf))
     return float(value), float(error)
@@ -235,15 +246,15 @@ def guess_start_time(
 ) -> float:
     """Return the time, s, at which the line of `guess_from_data` gives the T_0 of a gas.
 
-    It is the known one if t0 is not free, or if T_0 is free too, and within 3 errors of it.
+    It is the known one if t0 is not free, or if T_0 is free, too. It stays within 3 errors of it.
     """
     t0, error = known
     if START_TIME not in free or "temperature" in free:
         return t0
     times, T = _above_noise(curve)
     since = times - times[0]
-    power, line = _power_and_line(gas, curve)
-    intercept, slope = _intercept_and_slope(since, line)
+    power = power_of_line(gas)
+    intercept, slope = _intercept_and_slope(since, (T / T[0]) ** -power)
     guess = ((np.asarray(gas.temperature) / T[0]) ** -power - intercept) / slope
     guess = times[0] + np.clip(np.where(slope > 0, guess, 0.0), -since[-1], 0.5 * since[-1])
     return float(np.clip(guess, t0 - 3 * error, t0 + 3 * error))
@@ -262,40 +273,30 @@ def _above_noise(curve: CoolingCurve) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(curve.times)[rows], np.asarray(curve.temperature)[rows]
 
 
-def _power_and_line(gas: Gas, curve: CoolingCurve) -> tuple[float, np.ndarray]:
-    """Return the negative power of T that is a straight line in time, and that line, 1 at first."""
-    _, T = _above_noise(curve)
-    power = power_of_line(gas)
-    return power, (T / T[0]) ** -power
-
-
 def power_of_line(gas: Gas) -> float:
     """Return p for which T^(-p) of a cooling gas is a straight line in time."""
     return 1 / 2 if isinstance(gas.law, ConstantRestitution) else 3 / 5
 
 
 def _intercept_and_slope(times: np.ndarray, line: np.ndarray) -> tuple[Any, Any]:
-    """Fit a straight line by least squares with equal relative errors."""
-    weight = 1 / line
-    design = np.stack([weight, weight * times], axis=1)
-    size = np.linalg.norm(design, axis=0)
-    intercept, slope = np.linalg.lstsq(design / size[None], weight * line, rcond=None)[0] / size
+    """Fit a straight line with equal relative errors, whose intercept is positive."""
+    slope, intercept = np.polyfit(times, line, 1, w=1 / line)
     return np.maximum(intercept, 0.1 * line.min()), slope
 
 
 def _guess_elements(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> dict[str, Any]:
     """Guess free parameters of the elements that are at an end of their range.
 
-    A fit in an unconstrained scale cannot start there. The guess is 0 for beta_t; for T_rot at
-    t = 0 it is the first measured one or a tenth of T_0, and for a drag rate a tenth of the mean
-    cooling rate.
+    A fit in an unconstrained scale cannot start there. The guess is 0 for beta_t, .8 for the
+    restitution of walls, and a tenth of the mean cooling rate for a drag rate. For T_rot at t = 0
+    it is the larger one of the first two measured values, or a tenth of T_0.
     """
     measured = curve.rotational_temperature
     times, T = _above_noise(curve)
     T_0 = np.asarray(gas.temperature)
     T_rot = 0.1 * T_0
     if measured is not None:
-        T_rot = np.maximum(np.asarray(measured)[0], np.asarray(measured)[1])
+        T_rot = np.max(np.asarray(measured)[:2])
     drag = 0.1 * np.maximum(np.log(T[0] / T[-1]) / times[-1], 1e-9 / times[-1])
     guesses = {
         "tangential_restitution": np.zeros(()),
@@ -324,8 +325,8 @@ def prior_residuals(
 ) -> dict[str, tuple[np.ndarray, dict[str, np.ndarray]]]:
     """Return (value - known value) / standard error of each prior, and its derivatives.
 
-    Both are in the unconstrained scale; the derivatives are those in SI values, shape (size, size),
-    by the name of the parameter.
+    Differences are taken in the unconstrained scale. Derivatives are in SI values, by the name of
+    the parameter, of shape (n, size) for n residuals.
 
     Args:
         priors: the known values.
@@ -333,6 +334,10 @@ def prior_residuals(
         values: SI values of the parameters that are varied, by name.
     """
     rows = {}
+
+    def value_of(name: str) -> np.ndarray:
+        return np.asarray(values[name] if name in values else gas.value(name))
+
     for name, (given, error) in priors.items():
         if name == SMOOTHNESS:
             floats = {n: jnp.asarray(values[n]) for n in law_fields(gas.law) if n in values}
@@ -343,10 +348,6 @@ def prior_residuals(
         given = np.asarray(given)
         error = np.asarray(error)
         width = error / domain.slope(given)
-
-        def value_of(name: str) -> np.ndarray:
-            return np.asarray(values[name] if name in values else gas.value(name))
-
         if name == DENSITY:
             mass = value_of("mass")
             diameter = value_of("diameter")
@@ -356,12 +357,12 @@ def prior_residuals(
             value = value_of(name)
             slopes = {name: 1 / (domain.slope(value) * width)}
         row = np.ravel((domain.to_free(value) - domain.to_free(given)) / width)
-        diagonal = {
+        matrices = {
             key: np.diag(np.broadcast_to(np.ravel(slope), row.shape))
             for key, slope in slopes.items()
             if key in values
         }
-        rows[name] = row, diagonal
+        rows[name] = row, matrices
     return rows
 
 

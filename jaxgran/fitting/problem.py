@@ -148,6 +148,19 @@ class Problem:
                 f"{self.num_free} parameters; free fewer of them"
             )
 
+    def check_start(self, flat: np.ndarray) -> None:
+        """Raise ValueError if a search through a logarithm would begin at minus infinity."""
+        at_end = [
+            f"{unknown.title} = {value}"
+            for unknown, value in self.parts(flat)
+            if not np.all(np.isfinite(unknown.domain.to_free(value)))
+        ]
+        if at_end:
+            raise ValueError(
+                f"a fit cannot start at {', '.join(at_end)}, an end of the range: give the gas, or "
+                "start, a value inside it"
+            )
+
     def flat(self, values: dict[str, dict[str, Any]]) -> np.ndarray:
         """Return SI values, by label and name, in their unconstrained scale, in one array.
 

@@ -78,6 +78,7 @@ def build_problem(request: Request) -> tuple[Problem, np.ndarray, list[str]]:
             for label, guess in guesses.items()
         }
         first = _better(problem, first, problem.flat(_values_of_guesses(problem, started)))
+    problem.check_start(first)
     return problem, first, notes
 
 

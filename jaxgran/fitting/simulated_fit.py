@@ -101,12 +101,7 @@ def fit_through_simulations(
     problem = replace(problem, unknowns=problem.unknowns[: len(request.names)])
     problem.check_points()
     first = problem.flat({"": guess.parameters})
-    if not np.all(np.isfinite(first)):
-        at = ", ".join(f"{name} = {guess.value(name)}" for name in request.names)
-        raise ValueError(
-            f"a fit cannot start at {at}: positive parameters are fitted in their logarithm. Give "
-            "start inside their ranges, or leave it out"
-        )
+    problem.check_start(first)
     theory, _ = curve_rows("", known_to_theory, KineticTheory(), fits_T_0=fits_T_0, fits_t0=True)
     theory = with_rate_error(replace(theory, used=rows.used), model, _gas_of_theory(guess))
     sims = Simulations(problem, theory, key, progress)

@@ -3,8 +3,8 @@
 Each step uses one simulation with new random numbers, and its derivatives. The estimate is the mean
 of the Gauss-Newton estimates of all simulations near it; the noise of the simulations is part of
 its error. Residuals are weighted by the covariance that kinetic theory gives to the measured run
-(`jaxgran.fitting.innovations`), the errors of the measurement and the noise of the simulations. By
-an optax transformation each step is one simulation with its gradient in reverse mode, and the
+(`jaxgran.fitting.innovations`), the errors of the measurement and the noise of the simulations.
+With an optax transformation each step is one simulation with its gradient in reverse mode, and the
 estimate is the mean of the last half of the steps (Polyak average).
 """
 
@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from jaxgran.data.curve import CoolingCurve, Run
 from jaxgran.fitting.comparison import Comparison
-from jaxgran.fitting.information import FEW_PARTICLES, SOURCE_STEP, inverse, positive
+from jaxgran.fitting.information import FEW_PARTICLES, decrease_with_variance, inverse
 from jaxgran.fitting.parameters import with_parameters
 from jaxgran.fitting.prediction import predicted_curve
 from jaxgran.fitting.problem import Problem
@@ -39,19 +39,18 @@ MAX_NOISE_SHARE = 0.5
 """Share of the standard error up to which the noise needs no further simulations."""
 
 THEORY_DEGREES = 8
-"""Number of independent replicas that would tell the noise of a simulation as well as kinetic
-theory does. Two or three replicas say little of it, and a search that ends as soon as they say that
-it is small would believe the quiet ones."""
+"""Degrees of freedom of replicas that tell the noise of a simulation as well as kinetic theory
+does. By two or three replicas alone a search would end whenever they happen to agree."""
 
 NOISE_WINDOW = 9
 """Number of neighbouring times over which the variance between replicas is averaged."""
 
 MAX_LINEARISED = 30
-"""Number of parameters up to which a fit by descent through simulations has errors: more are not
-determined one by one."""
+"""Number of parameters up to which a fit through simulations has errors: more are not determined
+one by one."""
 
 NUM_LINEARISED = 2
-"""Number of simulations that give these error bars."""
+"""Number of simulations at the estimate of a descent, which give its errors."""
 
 
 class Simulation(NamedTuple):
@@ -99,8 +98,8 @@ class Simulations:
         theory: the same measurement for kinetic theory, which knows how N grains scatter.
         key: of the random numbers.
         progress: whether to show progress bars.
-        starts: see `jaxgran.data.curve.Run`: elastic spheres in equilibrium know nothing of the
-            law, and their velocities are independent of their positions.
+        starts: of equilibrated spheres, which all runs share and add to (`jaxgran.data.curve.Run`).
+            They depend on no parameter of the law, and velocities are drawn anew.
     """
 
     problem: Problem
@@ -135,12 +134,14 @@ class Simulations:
         return computed
 
     def logs_of(self, curve: CoolingCurve) -> Float[Array, "*replicas values"]:
-        """Return ln T at all times, followed by ln T_rot (0 where it is not compared)."""
-        log_T = jnp.log(curve.temperature)
-        if not self.rows.uses_rotation:
-            return jnp.concatenate([log_T, jnp.zeros_like(log_T)], axis=-1)
-        assert curve.rotational_temperature is not None
-        return jnp.concatenate([log_T, jnp.log(curve.rotational_temperature)], axis=-1)
+        """Return ln T at all times, followed by ln T_rot, or 0 where there is none."""
+        T = curve.temperature
+        rotation = jnp.ones_like(T)
+        if self.rows.uses_rotation:
+            assert curve.rotational_temperature is not None
+            rotation = curve.rotational_temperature
+        values = jnp.concatenate([T, rotation], axis=-1)
+        return jnp.log(jnp.where(values == 0, 1.0, values))
 
     @property
     def measured(self) -> Float[np.ndarray, "values"]:
@@ -170,50 +171,55 @@ class Simulations:
         )
         return simulation, curve
 
-    def beside_theory(self, flat: np.ndarray, variance: np.ndarray) -> Comparison:
-        """Return the measurement beside kinetic theory, with a variance of the simulations."""
-        floats = self.problem.values(flat)[""]
-        known = {name: x for name, x in floats.items() if name in self.theory.gas.domains}
+    def comparison_with_theory(self, flat: np.ndarray, variance: np.ndarray) -> Comparison:
+        """Compare kinetic theory with the measurement, with a variance of the simulations."""
+        values = self.problem.values(flat)[""]
+        known = {name: x for name, x in values.items() if name in self.theory.gas.domains}
         rows = replace(self.theory, simulation=variance.reshape(2, -1).T)
         return Comparison(predicted_curve(rows, KineticTheory(), known, []))
 
     def average(self, near: list[Simulation]) -> Average:
         """Return the mean of the Gauss-Newton estimates of some simulations, the newest last."""
-        resolution = self.model.derivative_accuracy
         variance = np.mean([s.variance for s in near], axis=0) / len(near)
-        comparison = self.beside_theory(near[-1].flat, variance)
+        comparison = self.comparison_with_theory(near[-1].flat, variance)
         estimates = []
         noises = []
-        p = near[-1].flat.size
-        slopes = np.mean([s.slope for s in near], axis=0)
         for s in near:
-            difference = self.measured - s.values
             # Slope and values of one run share their noise, whose product would move the estimate:
             # each run takes the mean slope of the others.
-            slope = s.slope
-            if len(near) > 1:
-                slope = slopes + (slopes - s.slope) / (len(near) - 1)
-            columns = np.concatenate([difference[:, None], slope, s.deviation.T], axis=1)
-            columns = comparison.whiten(columns)
-            gain = np.linalg.pinv(columns[:, 1 : 1 + p], rcond=resolution)
-            estimates.append(s.flat + gain @ columns[:, 0])
-            replicas = len(s.deviation)
-            shift = gain @ columns[:, 1 + p :] / (replicas * (replicas - 1)) ** 0.5
-            noises.append(shift @ shift.T)
-        sensitivity = comparison.whiten(slopes)
+            others = [x.slope for x in near if x is not s] or [s.slope]
+            estimate, noise = self._estimate(s, np.mean(others, axis=0), comparison)
+            estimates.append(estimate)
+            noises.append(noise)
+        slope = np.mean([s.slope for s in near], axis=0)
+        sensitivity = comparison.whiten(slope)
         information = sensitivity.T @ sensitivity
         noise = np.mean(noises, axis=0)
-        expected = self.expected_noise(comparison, slopes, information, len(near[-1].deviation))
+        expected = self.expected_noise(comparison, slope, information, len(near[-1].deviation))
         if expected is not None:
             degrees = sum(len(s.deviation) - 1 for s in near)
             total = THEORY_DEGREES + degrees
             noise = (THEORY_DEGREES * expected + degrees * noise) / total
         return Average(np.mean(estimates, axis=0), information, noise / len(near), comparison)
 
+    def _estimate(
+        self, s: Simulation, slope: Float[np.ndarray, "values p"], comparison: Comparison
+    ) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "p p"]]:
+        """Return the Gauss-Newton estimate of one simulation, and its noise by the replicas."""
+        p = s.flat.size
+        difference = self.measured - s.values
+        columns = np.concatenate([difference[:, None], slope, s.deviation.T], axis=1)
+        whitened = comparison.whiten(columns)
+        difference, slope, deviation = np.split(whitened, [1, 1 + p], axis=1)
+        gain = np.linalg.pinv(slope, rcond=self.model.derivative_accuracy)
+        replicas = deviation.shape[1]
+        shift = gain @ deviation / (replicas * (replicas - 1)) ** 0.5
+        return s.flat + (gain @ difference)[:, 0], shift @ shift.T
+
     def expected_noise(
         self,
         comparison: Comparison,
-        slopes: Float[np.ndarray, "values p"],
+        slope: Float[np.ndarray, "values p"],
         information: Float[np.ndarray, "p p"],
         replicas: int,
     ) -> Float[np.ndarray, "p p"] | None:
@@ -225,23 +231,22 @@ class Simulations:
         number = getattr(self.model, "num_particles", None)
         if number is None:
             return None
-        covariance = inverse(information)
-        by_grains = covariance @ information_by(comparison, slopes, FEW_PARTICLES) @ covariance
+        resolution = self.model.derivative_accuracy
+        covariance = np.linalg.pinv(information, rcond=resolution**2, hermitian=True)
+        by_grains = covariance @ information_by(comparison, slope, FEW_PARTICLES) @ covariance
         return by_grains / (self.theory.grains.inverse_number * number * replicas)
 
 
 def information_by(
-    comparison: Comparison, slopes: Float[np.ndarray, "values p"], source: str
+    comparison: Comparison, slope: Float[np.ndarray, "values p"], source: str
 ) -> Float[np.ndarray, "p p"]:
     """Return the decrease of the information with the logarithm of the variance by one source."""
 
     def information(factor: float) -> np.ndarray:
-        rows = replace(comparison, sources={source: factor}).whiten(slopes)
-        return rows.T @ rows
+        whitened = replace(comparison, sources={source: factor}).whiten(slope)
+        return whitened.T @ whitened
 
-    less = information(1 - SOURCE_STEP)
-    more = information(1 + SOURCE_STEP)
-    return positive((less - more) / (2 * SOURCE_STEP))
+    return decrease_with_variance(information)
 
 
 def variance_of_mean(deviation: Float[np.ndarray, "replicas used"]) -> Float[np.ndarray, "used"]:
@@ -261,7 +266,7 @@ class Search(NamedTuple):
         near: the simulations near the estimate.
         curve: curve of the last simulation.
         num_simulations: number of all simulations.
-        converged: whether the last step was below `AVERAGING_DISTANCE`, or the descent ended.
+        converged: whether the last step was below `AVERAGING_DISTANCE`, or the loss ceased to fall.
         trace: course of a gradient descent; None for other searches.
     """
 
@@ -277,17 +282,17 @@ def by_gauss_newton(sims: Simulations, first: np.ndarray, max_simulations: int) 
     """Search by Gauss-Newton steps, each on one simulation and its derivatives.
 
     Each simulation has different random numbers. The simulations within `AVERAGING_DISTANCE` of the
-    last one give independent Gauss-Newton estimates; their mean is the result. The noise of the
-    result is estimated from the changes that single replicas would make to it. The search ends when
-    a step is below `AVERAGING_DISTANCE` and the noise is below `MAX_NOISE_SHARE` of the standard
-    error.
+    last one give independent Gauss-Newton estimates; their mean is the result. Its noise follows
+    from the changes that single replicas would make to it, averaged with the one that kinetic
+    theory expects (`THEORY_DEGREES`). The search ends when there are two simulations near, a step
+    is below `AVERAGING_DISTANCE`, and the noise is below `MAX_NOISE_SHARE` of the standard error.
     """
     flat = np.asarray(first, float)
     simulations: list[Simulation] = []
     hidden = None if sims.progress else True  # None hides the bar where there is no terminal
     with tqdm(total=max_simulations, disable=hidden, desc="fit", unit="simulation") as bar:
-        while True:
-            simulation, curve = sims.run(flat, len(simulations))
+        for stream in range(max_simulations):
+            simulation, curve = sims.run(flat, stream)
             simulations.append(simulation)
             near = [s for s in simulations if np.abs(s.flat - flat).max() < AVERAGING_DISTANCE]
             average = sims.average(near)
@@ -301,8 +306,7 @@ def by_gauss_newton(sims: Simulations, first: np.ndarray, max_simulations: int) 
             in_errors = np.abs(step / np.sqrt(variance)).max()
             bar.update()
             bar.set_postfix_str(f"last step {in_errors:.2g} standard errors")
-            ended = converged and len(near) > 1 and low_noise
-            if ended or len(simulations) == max_simulations:
+            if converged and len(near) > 1 and low_noise:
                 break
     return Search(average._replace(flat=flat), near, curve, len(simulations), converged)
 
@@ -312,28 +316,32 @@ def by_descent(
 ) -> Search:
     """Search by gradient descent.
 
+    Each step takes the gradient of |W (y - f)|^2, plus that of the prior, through a simulation with
+    different random numbers. Here y and f are the measured and simulated ln T and ln T_rot, and W
+    whitens them as kinetic theory does at the first parameters. The estimate is the mean of the
+    last half of the steps; of a descent that diverges it is the step with the smallest loss.
     `NUM_LINEARISED` further simulations at the estimate give its errors.
     """
-    used = jnp.asarray(sims.rows.used.T.ravel())
     measured = sims.measured
-    errors = (sims.rows.errors / np.where(sims.rows.used > 0, sims.rows.values, 1.0)).T.ravel()
-    scale = np.sqrt(errors**2 + 2 * sims.theory.grains.inverse_number)
+    size = measured.size
+    theory = sims.comparison_with_theory(first, np.zeros(size))
+    whitening = jnp.asarray(theory.whiten(np.eye(size)))
 
     def loss(flat: Array, stream: int) -> Array:
-        curve = sims.curve_at(flat, stream)
-        residuals = used * (sims.logs_of(curve) - measured) / scale
+        residuals = whitening @ (sims.logs_of(sims.curve_at(flat, stream)) - measured)
         prior = sims.gas_at(flat).law.prior_residuals()
         return jnp.sum(residuals**2) + jnp.sum(prior**2)
 
     def at(flat: np.ndarray, step: int) -> Loss:
         return Loss(*jax.value_and_grad(loss)(jnp.asarray(flat), step))
 
-    size = int(np.sum(sims.rows.used))
-    course = descent.descend(at, first, max_simulations, size, sims.problem.estimates, noisy=True)
+    used = int(np.sum(sims.rows.used))
+    course = descent.descend(at, first, max_simulations, used, sims.problem.estimates, noisy=True)
     flats = course.flats
-    averaged = 1 if course.diverged else (len(flats) + 1) // 2
+    averaged = (len(flats) + 1) // 2
     flat = np.mean(flats[-averaged:], axis=0)
     if course.diverged:
+        averaged = 1
         flat = flats[np.argmin(course.losses)]
     streams = range(len(flats), len(flats) + NUM_LINEARISED)
     runs = [sims.run(flat, stream) for stream in streams]
