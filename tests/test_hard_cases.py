@@ -210,7 +210,7 @@ def corrupted_curves():
     outliers = np.where(np.arange(40) % 20 == 5, 1.2, 1.0)
     for name, T, words in (
         ("outliers", exact * noise * outliers, "far outliers at t ="),
-        ("T rises", (exact * noise)[::-1], "scatters more than N equal spheres"),
+        ("T rises", (exact * noise)[::-1], "scatter more about the model"),
     ):
         wrong = jaxgran.CoolingCurve(times, T, temperature_error=0.01 * exact)
         result = jaxgran.fit(jaxgran.Measurement(gas, wrong), model=THEORY, free=FREE)

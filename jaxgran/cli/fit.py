@@ -210,7 +210,7 @@ def summary_of(result: jaxgran.Fit, model: Any) -> dict[str, Any]:
         "p_value": result.p_value,
     }
     if len(result.measurements) > 1:
-        summary["agree"] = result.p_value > SIGNIFICANCE
+        summary["agree"] = result.p_value >= SIGNIFICANCE
     return as_json(summary | {"converged": result.converged})
 
 

@@ -151,7 +151,7 @@ def compare_alternatives(
     kinds = [] if is_driven else kinds_of(problem, bases[0].flat, absent)
     significant = float(scipy.stats.chi2.isf(PREFERENCE_LEVEL / max(len(kinds), 1), 1))
     found = problem.evaluate(bases[0].flat)
-    if goodness(problem, found)["smooth_p_value"] < SIGNIFICANCE / 2:
+    if goodness(problem, found)["smooth_p_value"] < SIGNIFICANCE:
         # Such a curve prefers whatever has less noise.
         significant = np.inf
     profiles = {

@@ -55,7 +55,7 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
         explanations = compare_alternatives(problem, minima, noise, request.absent, is_driven)
     result = assembled(request, problem, best, minima, explanations)
     share = measurement_share(problem, problem.evaluate(best.flat))
-    if result.p_value < SIGNIFICANCE / 2 and not request.quick and not distant:
+    if result.p_value < SIGNIFICANCE and not request.quick and not distant:
         notes += _outlier_notes(problem, first, max_steps)
     scatter = problem.evaluate(best.flat).scatter_of_eps
     if scatter is not None:
@@ -91,7 +91,7 @@ def _outlier_notes(problem: Problem, first: np.ndarray, max_steps: int) -> Itera
     """Yield a clause on far outliers, and the first parameter of a fit without them."""
     rest, end, left_out = without_outliers(problem, first, max_steps)
     found = rest.evaluate(end.flat)
-    if not left_out or goodness(rest, found)["p_value"] < SIGNIFICANCE / 2:
+    if not left_out or goodness(rest, found)["p_value"] < SIGNIFICANCE:
         return
     times = {m.label: np.asarray(m.curve.times) for m in problem.curves}
     places = [

@@ -9,8 +9,8 @@ from jaxgran.fitting.comparison import Residuals
 from jaxgran.fitting.problem import Evaluation, Problem
 from jaxgran.fitting.rows import SCATTER
 
-SIGNIFICANCE = 0.01
-"""Level of significance of the test of the misfit, half of it on each side."""
+SIGNIFICANCE = 0.005
+"""Level of significance of the test of the misfit, on each side."""
 
 
 def goodness(problem: Problem, found: Evaluation) -> dict[str, Any]:

@@ -25,16 +25,16 @@ NEGLIGIBLE_SHARE = 0.01
 """Share of an estimate below which the low end of a range counts as 0."""
 
 MAX_RATIO = 3.0
-"""Ratio of the ends of a range from which on a positive parameter is not determined."""
+"""Ratio of the ends of a range above which a positive parameter counts as not determined."""
 
 UNBOUNDED = 1e3
-"""The same of the high end to the estimate, above which the range has no high end."""
+"""Ratio of the high end of a range to the estimate, above which the range counts as open."""
 
 DECISIVE_WEIGHT = 0.8
-"""Weight in a parameter from which on impacts, or curves, are said to determine it."""
+"""Weight in a parameter above which impacts, or curves, are said to determine it."""
 
 MIN_PARTICLES = 50
-"""Particles of a model from which on the noise of its curves is known."""
+"""Least number of particles of a model whose noise is known."""
 
 DETERMINED = "determined"
 NOT_DETERMINED = "not determined"
@@ -53,8 +53,8 @@ MESSAGES = {
     "unknown": "{symbol} is not determined",
     "constant": "{headline}. A constant coefficient of restitution, {eps:.3g}, explains the data "
     "{as_well}: then A has no meaning",
-    "no meaning": "it is {eps:.3g}, and A has no meaning",
-    "narrowing": "if there is no {effects}, {range}: declare `absent: {names}`, or give {given}",
+    "narrowing": "without {effects}, {range}: if this is known, declare `absent: {names}`, or give "
+    "{given}",
     # the verdict
     "not converged": "The search did not converge: do not trust its estimates.",
     "not consistent": "{Model} {be} not consistent with {data}: do not trust the estimates."
@@ -68,65 +68,71 @@ MESSAGES = {
     "{why}.{edge}",
     "edge": " The scene is at the edge of the model's validity.",
     "other minima": "other parameters fit {data} as well",
-    "no group": "{data} {do} not determine {names}",
-    "not compared": "alternatives were not compared",
+    "not compared": "{Model} {be} consistent with {data}. Alternatives were not compared: the "
+    "range of {symbol} that they allow is not known.{edge}",
     "possible": "{name} cannot be excluded, and {range}",
     # reasons
     "chi2": "reduced chi^2 is {reduced:.3g} for {degrees} degrees of freedom (probability by "
     "chance: {chance} %)",
-    "too rough": "the curve scatters more than N equal spheres can: a mixture of sizes, eps that "
-    "scatters, fewer grains than given, or noise of the measurement",
+    "scatters more": "the data scatter more about the model than their errors and N equal spheres "
+    "allow: another effect, a mixture of sizes, eps that scatters, fewer grains than given, or "
+    "noise of the measurement",
     "as few": " (some {number:.2g} grains would scatter as much)",
-    "too smooth": "the curve scatters less than N equal spheres do: grains that walls cool, more "
-    "grains than given, or a curve that was smoothed",
+    "scatters less": "the curve scatters less than N equal spheres do: grains that walls cool, "
+    "more grains than given, or a curve that was smoothed",
     "rising": "T rises from {first:.3g} to {last:.3g} m^2/s^2, and nothing drives this gas: "
-    "scatter does not explain it",
-    "gravity": "gravity is taken as absent: .01 g in a box with dissipating walls (restitution .8) "
-    "made A 9 % too small",
+    "check the order of the rows and the noise of the measurement, or give drive_strength",
+    "gravity": "gravity is taken as absent: in one simulated box with walls of restitution 0.8, "
+    "0.01 g made A 9 % too small",
     "errors too large": "the residuals are smaller than the errors of T allow by chance: these "
     "errors are too large, or they are common to the points",
     "scatter of eps": "eps of the impacts scatters by {scatter:.2g} beyond its errors",
     "scatter": "the curve scatters as {number:.3g} +- {error:.2g} grains do",
     "of each": "{label}: chi^2 is {chi2:.3g} for {number} points; its weight in {symbol} is "
     "{weight:.2f}",
-    "assumptions": "the model assumes {spheres}, {where}",
+    "assumptions": "the model assumes {all}",
     "absent": "known to be absent: {names}",
     "quick": "alternatives were not compared, as requested",
-    "driven": "additional loss terms were not tested: the gas is driven",
+    "driven": "alternatives were not compared: the gas is driven",
     "of particles": "the range over alternatives comes from kinetic theory, shifted to the fitted "
     "curve",
     "is preferred": "{name} added to the model decreases -2 ln L by {improvement:.3g}, which "
-    "happens by chance in less than 1 % of fits: then {range}",
+    "happens by chance in less than 1 % of fits: with it {range}",
+    "law is preferred": "{name}, {eps:.3g}, in place of the fitted law decreases -2 ln L by "
+    "{improvement:.3g}, which happens by chance in less than 1 % of fits: A has no meaning then",
+    "law is possible": "{name}, {eps:.3g}, in place of the fitted law cannot be excluded: A has no "
+    "meaning then; to exclude it, the errors must be {factor:.2g} times smaller",
     "outside": "the estimate {estimate:.3g} lies outside of this range, because it assumes that "
     "the preferred alternative is absent",
-    "is possible": "{name} cannot be excluded: then {range}; to exclude it, the errors must be "
+    "is possible": "{name} cannot be excluded: with it {range}; to exclude it, the errors must be "
     "{factor:.2g} times smaller",
     "outliers": "far outliers at {places}: check them and their error bars",
     "without outliers": "; without them {symbol} is {value:.3g} +- {error:.2g}",
     "distant": "nearly every T differs from the fitted one by more than a factor of {ratio:g}: "
     "alternatives were not compared; check the units, the scale of T and T0",
-    "max_steps": "the search did not converge: increase max_steps or free fewer parameters",
+    "max_steps": "the search did not converge: free fewer parameters, or in Python increase "
+    "max_steps",
     "simulations": "{number} simulations were run; their noise is at most {share:.0f} % of the "
     "standard error",
     "few particles": "{number} particles are too few for their noise to be known, and cool faster "
     "than a gas: give the model {least} or more",
     "undetermined": "{data} {do} not determine {names}: {why}; free fewer parameters",
-    "weak": "it hardly depends on this parameter",
-    "combination": "it depends only on a combination of them",
+    "weak": "it hardly depends on {names}",
+    "combination": "it depends only on a combination of {names}",
     "forgets": " (a cooling gas forgets its initial temperature)",
     "A and Y": " (in a gas of hard spheres A and Y enter only as A Y^(2/5))",
     "another minimum": "-2 ln L has another, equally good minimum at {places}: {data} {do} not "
     "distinguish them",
     "slopes": "the derivatives through particles err by an estimated {share:.2g} %, which the "
-    "standard error includes: more replicas, or differences=0.3 where the gas has a flow, reduce "
-    "it",
+    "standard error includes: more replicas reduce it, and where the gas has a flow "
+    "differences=0.3 in Python",
 }
 """Sentences by name, with places for values."""
 
 
 def say(name: str, /, **values: Any) -> str:
     """Return a sentence with its values, without blanks that empty values leave."""
-    return " ".join(MESSAGES[name].format(**values).split(" ")).replace("  ", " ").strip()
+    return MESSAGES[name].format(**values).replace("  ", " ").strip()
 
 
 def with_words(
@@ -151,15 +157,16 @@ def with_words(
         measurement_share: share of the errors of the measurement in the variances of T.
     """
     limitations = tuple(sorted(limitations, key=lambda limitation: not limitation.decisive))
-    rough = result.p_value < SIGNIFICANCE / 2
-    smooth = result.smooth_p_value < SIGNIFICANCE / 2
+    scatters_more = result.p_value < SIGNIFICANCE
+    scatters_less = result.smooth_p_value < SIGNIFICANCE
     rising = list(_rising(result))
-    is_misfit = rough or (smooth and measurement_share < 0.5) or bool(rising)
+    is_smooth = scatters_less and measurement_share < 0.5
+    is_misfit = scatters_more or is_smooth or bool(rising)
     grade, verdict = _verdict(result, is_misfit, limitations)
     reasons = [
         _chi2(result),
         *rising,
-        *_misfit(result, rough, smooth, is_misfit),
+        *_misfit(result, scatters_more, scatters_less, is_misfit),
         *_scatter(result),
         *_of_each(result),
         *_alternatives(result, absent, quick),
@@ -279,9 +286,9 @@ def _verdict(result: Fit, is_misfit: bool, limitations: tuple[Limitation, ...]) 
     if len(result.other_minima):
         why = say("other minima", **words)
     elif result.names[0] in group:
-        why = say("no group", names=" and ".join(map(symbol_of, group)), **words)
+        why = _why_undetermined(group)
     elif not result.ranges:
-        why = say("not compared")
+        return NOT_DETERMINED, say("not compared", **words)
     else:
         low, high = (float(x[0]) for x in result.ranges[result.names[0]])
         span = _range(result, low, high)
@@ -334,15 +341,17 @@ def _chi2(result: Fit) -> str:
     return say("chi2", reduced=result.reduced_chi2, degrees=degrees, chance=chance)
 
 
-def _misfit(result: Fit, rough: bool, smooth: bool, is_misfit: bool) -> Iterator[str]:
+def _misfit(
+    result: Fit, scatters_more: bool, scatters_less: bool, is_misfit: bool
+) -> Iterator[str]:
     known = [m.num_particles for m in result.measurements.values() if m.num_particles is not None]
-    if rough:
+    if scatters_more:
         as_few = ""
         if len(known) == len(result.measurements) == 1:
             as_few = MESSAGES["as few"].format(number=known[0] / result.reduced_chi2)
-        yield MESSAGES["too rough"] + as_few
-    if smooth:
-        yield say("too smooth" if is_misfit else "errors too large")
+        yield MESSAGES["scatters more"] + as_few
+    if scatters_less:
+        yield say("scatters less" if is_misfit else "errors too large")
 
 
 def _scatter(result: Fit) -> Iterator[str]:
@@ -385,31 +394,38 @@ def _alternatives(result: Fit, absent: tuple[str, ...], quick: bool) -> Iterator
     for alternative in result.alternatives:
         low = float(alternative.low[0])
         high = float(alternative.high[0])
-        span = _range(result, low, high)
-        if alternative.restitution is not None:
-            span = say("no meaning", eps=alternative.restitution)
+        kind = "law " if alternative.restitution is not None else ""
+        words = {
+            "name": alternative.name,
+            "eps": alternative.restitution,
+            "improvement": alternative.improvement,
+            "range": _range(result, low, high),
+            "factor": alternative.error_reduction_needed,
+        }
         if alternative.preferred:
-            name = alternative.name
-            improvement = alternative.improvement
-            yield say("is preferred", name=name, improvement=improvement, range=span)
+            yield say(f"{kind}is preferred", **words)
             if not low <= estimate <= high:
                 yield say("outside", estimate=estimate)
         elif not alternative.distinguishable:
-            factor = alternative.error_reduction_needed
-            yield say("is possible", name=alternative.name, range=span, factor=factor)
+            yield say(f"{kind}is possible", **words)
 
 
 def _assumptions(result: Fit) -> str:
     elements = {e for m in result.measurements.values() for e in m.gas.elements}
-    spheres = ", rough spheres of constant beta_t" if "surface" in elements else ", smooth spheres"
-    spheres = " spheres of constant friction" if "friction" in elements else spheres
-    spheres = f"equal{spheres}"
+    assumed = ["equal, smooth spheres"]
     if "diameter_sd" in elements:
-        spheres = "smooth spheres of one material, whose sizes differ as given"
-    where = [] if "container" in elements else ["far from walls"]
-    where += [] if "drag" in elements else ["in vacuum"]
-    where.append("at homogeneous density")
-    return say("assumptions", spheres=spheres, where=", ".join(where))
+        assumed = ["smooth spheres of one material, whose sizes differ as given"]
+    if "surface" in elements:
+        assumed = ["equal, rough spheres of constant beta_t"]
+    if "friction" in elements:
+        assumed = ["equal spheres of constant friction"]
+    if "container" not in elements:
+        assumed.append("far from walls")
+    if "drag" not in elements:
+        assumed.append("in vacuum")
+    if not getattr(result.model, "has_positions", False):
+        assumed.append("at homogeneous density")
+    return say("assumptions", all=", ".join(assumed))
 
 
 def _convergence(result: Fit) -> Iterator[str]:
@@ -422,19 +438,28 @@ def _convergence(result: Fit) -> Iterator[str]:
         yield say("simulations", number=result.iterations, share=share)
 
 
+def _names_of(group: tuple[str, ...]) -> str:
+    return " and ".join(map(symbol_of, group))
+
+
+def _why_undetermined(group: tuple[str, ...]) -> str:
+    """Say why data do not determine parameters."""
+    why = say("combination" if len(group) > 1 else "weak", names=_names_of(group))
+    if any(name.endswith("t0") for name in group):
+        return why + MESSAGES["forgets"]
+    if {"dissipative_constant", "youngs_modulus"} <= {*group}:
+        return why + MESSAGES["A and Y"]
+    return why
+
+
 def describe_search(result: Fit) -> Iterator[str]:
     """Yield clauses on few particles, undetermined parameters and equally good minima."""
     number = getattr(result.model, "num_particles", MIN_PARTICLES)
     if number < MIN_PARTICLES:
         yield say("few particles", number=number, least=MIN_PARTICLES)
     if group := result.undetermined:
-        why = MESSAGES["combination" if len(group) > 1 else "weak"]
-        if any(name.endswith("t0") for name in group):
-            why += MESSAGES["forgets"]
-        elif {"dissipative_constant", "youngs_modulus"} <= {*group}:
-            why += MESSAGES["A and Y"]
-        names = " and ".join(map(symbol_of, group))
-        yield say("undetermined", names=names, why=why, **_data_of(result))
+        why = _why_undetermined(group)
+        yield say("undetermined", names=_names_of(group), why=why, **_data_of(result))
     if len(result.other_minima):
         symbols = [symbol_of(name) for name in result.names]
         sets = [zip(symbols, other, strict=False) for other in result.other_minima]

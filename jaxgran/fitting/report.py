@@ -42,7 +42,7 @@ def report(result: Fit, *, explain: bool = False) -> str:
     lines += _alternatives(result)
     if len(result.measurements) > 1:
         agreement = "do not contradict each other"
-        if result.p_value <= SIGNIFICANCE:
+        if result.p_value < SIGNIFICANCE:
             agreement = "contradict each other, or the model"
         lines += ["", f"The measurements {agreement} (p = {result.p_value:.2g})."]
     lines += ["", *(f"  - {reason}" for reason in result.reasons)]
