@@ -13,6 +13,8 @@ and the dependence of the projected derivative on the interval between projectio
 
 hard_derivatives: hard spheres after 10 and 30 mean free times, below L_c and in a box of 1.1 L_c.
 
+dsmc_derivatives: DSMC after 10 and 50 collisions per particle, where it has no flow.
+
 derivatives_in_flows: hard spheres and disks in boxes longer than L_c, after 3, 10, 30 and 100
 collisions: finite differences of many sets of replicas with separate keys, projected derivatives
 and the estimate of their bias (`CoolingCurve.derivative_bias`), and derivatives by differences of
@@ -93,6 +95,12 @@ class Slopes:
             slopes.append((right - left) / (2 * STEP))
         return np.concatenate(slopes) - self.truncation
 
+    def projected_over_differences(self, model) -> tuple[dict, jaxgran.CoolingCurve]:
+        """Return how far projected derivatives are off, its error, and the curve."""
+        projected, curve = self.forward(model)
+        off, error = over(mean_and_error(projected), mean_and_error(self.differences(model)))
+        return {"off": off, "error": error}, curve
+
 
 def soft_spheres(name: str, options: Options) -> dict:
     (phi, beta, contact, size, many, sets), few, most = SOFT_SPHERES[name], 4, 64
@@ -143,10 +151,18 @@ def hard_derivatives(options: Options) -> Iterator[dict]:
         gas = glass(beta, phi)
         slopes = Slopes(gas, np.array([10.0, 30.0]) * float(gas.mean_free_time))
         model = jaxgran.HardSpheres(*((50, 2) if options.smoke else (500, replicas)))
-        projected, curve = slopes.forward(model)
-        off, error = over(mean_and_error(projected), mean_and_error(slopes.differences(model)))
-        row = {"phi": phi, "beta": beta, "off": off, "error": error}
-        yield row | {"told": curve.derivative_bias}
+        found, curve = slopes.projected_over_differences(model)
+        yield {"phi": phi, "beta": beta, "told": curve.derivative_bias} | found
+
+
+def dsmc_derivatives(options: Options) -> Iterator[dict]:
+    collisions = (10.0, 50.0)
+    for phi, beta in ((0.08, 0.1), (0.08, 0.3), (0.08, 1.0)):
+        gas = glass(beta, phi)
+        slopes = Slopes(gas, times_of(gas, collisions))
+        model = jaxgran.DSMC(*((200, 2) if options.smoke else (20_000, 32)))
+        found, _ = slopes.projected_over_differences(model)
+        yield {"phi": phi, "beta": beta, "collisions": collisions} | found
 
 
 def derivatives_in_flows(options: Options) -> dict:
@@ -247,4 +263,4 @@ def draw_derivatives(axes, found: dict, looks: dict, low=-np.inf, high=np.inf) -
 
 if __name__ == "__main__":
     soft = {f"gradient_health_{name}": partial(soft_spheres, name) for name in SOFT_SPHERES}
-    run_parts(__doc__, hard_derivatives, derivatives_in_flows, named=soft)
+    run_parts(__doc__, hard_derivatives, dsmc_derivatives, derivatives_in_flows, named=soft)
