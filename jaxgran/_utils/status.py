@@ -1,4 +1,4 @@
-"""Status of a run: one bit for each fault, since compiled code cannot raise exceptions."""
+"""Status of a run: one bit for each fault, since compiled runs raise no exceptions."""
 
 from typing import NamedTuple
 
@@ -40,9 +40,9 @@ STEP_TOO_LARGE = Fault(
 )
 NOT_FINITE = Fault(
     16,
-    "a position or velocity is not a finite number",
-    "check the initial state for coincident spheres, and values of the gas that are so small or "
-    "large that their powers are 0 or infinite",
+    "a result is not a finite number",
+    "check for values of the gas that are so small or large that their powers are 0 or infinite, "
+    "and a given start for coincident spheres",
 )
 STALLED = Fault(
     32,
@@ -79,7 +79,7 @@ BOX_TOO_SMALL = Fault(
 ENERGY_DRIFT = Fault(
     2048,
     "the energy balance of the whole run is off by more than 5 %, by small errors of many steps",
-    "increase steps_per_contact, or use float64 instead of single precision",
+    "increase steps_per_contact, or use float64 instead of float32",
 )
 OUT_OF_RANGE = Fault(
     4096,

@@ -38,7 +38,7 @@ class Parameter(NamedTuple):
 
 # fmt: off
 _ROWS = (
-    # name, symbol, unit, domain (packing_fraction: up to close packing), of, owners
+    # name, symbol, unit, domain, of, owners. `Gas` allows packing_fraction up to close packing.
     ("youngs_modulus", "Y", "Pa", POSITIVE, MATERIAL, "Viscoelastic"),
     ("poisson_ratio", "nu", "", Domain(-1.0, 0.5), MATERIAL, "Viscoelastic"),
     ("dissipative_constant", "A", "s", NON_NEGATIVE, MATERIAL, "Viscoelastic"),
@@ -67,10 +67,10 @@ _ROWS = (
 # fmt: on
 
 PARAMETERS = {row[0]: Parameter(*row[:5], owners=row[5:]) for row in _ROWS}
-"""Parameters by name; the parameters of a class are in the order of its fields.
+"""Parameters by name; the parameters of a class are in the order of the table.
 
-Two are no fields: t0, the time at which the gas began to cool, and density, the mass of a grain
-over its volume."""
+Three are no fields: t0, the time at which the gas began to cool; density, the mass of a grain over
+its volume; and wall_coefficient, which is the coefficient of the law of the walls."""
 
 BY_SYMBOL = {p.symbol: p for p in PARAMETERS.values() if p.symbol}
 """Parameters that files and options name, by symbol."""

@@ -274,7 +274,7 @@ def loss_moments(
 
 
 _STEEP = 5.0
-"""m from which on a series in 1/m^2 is used in `slip_moments`."""
+"""m above which `slip_moments` uses a series in 1/m^2."""
 
 _STEEP_SERIES = [2 * (-1) ** n * (n + 1) / (2 * n + 3) for n in range(9, -1, -1)]
 """``m^2 (m arccot m - m^2/(1 + m^2))`` in powers of 1/m^2, the highest first."""

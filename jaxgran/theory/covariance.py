@@ -93,7 +93,7 @@ class Mean(NamedTuple):
         collisions: per particle since t = 0.
         spins: T_rot/T of rough spheres, 0 of smooth ones, and cumulants as in `Moments`, None
             where spins are taken to be Gaussian.
-        size_ratio: q of spheres of unequal sizes; None of equal ones.
+        size_ratio: q of spheres of unequal sizes; None for equal ones.
     """
 
     log_temperature: Any

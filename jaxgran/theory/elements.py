@@ -101,7 +101,7 @@ def mean_kick(law: ReducedLaw, speed: Float[Array, "*points"]) -> Float[Array, "
 
 
 MAX_STICKING = 1e6
-"""Largest friction over the slip at which some spheres slide in double precision."""
+"""Bound of the friction over the slip, above which no sphere slides in double precision."""
 
 _STEP = 0.04
 """Steps of variances over S and V: second derivatives are then right to 1e-3."""
@@ -215,12 +215,15 @@ def _wall_rates(
 
     A wall takes ``(1 - eps^2) v_n^2/2`` in an impact, on average ``(1 - eps^2) T`` at constant eps.
     It takes more from fast spheres, which come more often, and so changes a_2, at constant eps and
-    Z impacts by ``(4/d) Z (1 - eps^2) (a_2 - (2 eps^2 - 1)/(d + 2))``. The mean k-th power of the
-    speed is ``1 + k (k - 2) a_2/8`` times its value in a Maxwellian gas.
-    Friction at a wall takes from one sphere what friction between two spheres takes from both, each
-    of which has half of the mean squared relative velocity. So walls count as twice as many impacts
-    between spheres, with half the eta of a wall. Walls reverse velocities, which changes the
-    displacements.
+    Z impacts in a unit of time:
+
+        da_2/dt = (4/d) Z (1 - eps^2) ((1 + a_2) (1 + 3 a_2/8)
+                                       - (1 + 15 a_2/8) (d + 1 + 2 eps^2)/(d + 2)).
+
+    The mean k-th power of the normal speed is ``1 + k (k - 2) a_2/8`` times its value in a
+    Maxwellian gas. The relative velocity of two spheres has twice the variance of the velocity of
+    one, and a wall acts on one sphere only. So friction in an impact on a wall is that of two
+    impacts between spheres with half the eta. <dr^2> of a gas between walls is not computed.
     """
 
     def axis_rates(frequency: Array) -> ElementRates:
@@ -265,8 +268,8 @@ MAX_SPEED_FACTOR = 1.2
 def element_bounds(scene: ReducedScene, dimension: int) -> ElementBounds:
     """Return upper bounds of the cooling and the heating by the elements of a scene.
 
-    Spheres that do not rotate, and that stop at walls, cool fastest. The
-    rotation heats at most by the initial energy of the spins.
+    Spheres that do not rotate, and that stop at walls, cool fastest. The rotation heats at most by
+    the initial energy of the spins.
 
     Returns:
         the part of ``-d ln T/dt`` over sqrt(T/T_0); its part that does not depend on T; d(T/T_0)/dt

@@ -6,9 +6,9 @@ compile as `diffrax.diffeqsolve` with its events, adjoints and rounding of times
 
 `MomentSolver.moments` has one linear rule for forward and reverse mode: the tangents of those
 parameters of the scene that change are integrated together with the state, in the same steps, so
-that they are the derivatives of the discrete solution. A scene has few parameters in reduced units,
-and mostly one of them changes. `MomentSolver.moments_along` integrates tangents along given
-directions instead.
+that they are the derivatives of the discrete solution at fixed steps. A scene has few parameters in
+reduced units, and mostly one of them changes. `MomentSolver.moments_along` integrates tangents
+along given directions instead.
 """
 
 from collections.abc import Callable
@@ -49,7 +49,7 @@ class _Progress(NamedTuple):
     Attributes:
         time: reached by the accepted steps.
         state: y at this time.
-        values: y at the output times, shape (times, ...); those not reached have any value.
+        values: y at the output times, shape (times, ...); y(0) at those not reached.
         num_known: number of output times that are reached.
         num_steps: number of steps tried.
         step_end: end of the next step.
@@ -126,9 +126,9 @@ def integrate_at(
         max_steps: largest number of steps, including rejected ones.
 
     Returns:
-        The states at those times, and whether the last time was reached within that number of
-        steps. Otherwise the states at the times that were not reached mean nothing: they are
-        y(0), or nan where diffrax ran the solver and failed.
+        The states at those times, and False if `max_steps` ended the integration. The states at
+        the times that were not reached then mean nothing: they are y(0), or inf by diffrax. Where
+        diffrax fails for another reason all states are nan.
     """
     term = diffrax.ODETerm(lambda t, y, args: vector_field(t, y))
     if not isinstance(solver, diffrax.AbstractERK):
@@ -353,11 +353,11 @@ class MomentSolver(NamedTuple):
         """Return the rows at the given times, shape (times, rows, states), and a status."""
         dtype = times.dtype
         controlling = self.equations.controlling
-        known = jnp.all(jnp.isfinite(parameters)) & jnp.all(jnp.isfinite(times))
+        inputs_finite = jnp.all(jnp.isfinite(parameters)) & jnp.all(jnp.isfinite(times))
         # With nan parameters the state stays constant, so that the solver does not shorten its
         # steps.
-        times = jnp.where(known, times, jnp.linspace(1.0, 2.0, times.size, dtype=dtype))
-        # Only the state controls the steps: tangents are then derivatives of the discrete solution.
+        times = jnp.where(inputs_finite, times, jnp.linspace(1.0, 2.0, times.size, dtype=dtype))
+        # Only the state controls the steps, so tangents are its derivatives at fixed steps.
         controller = diffrax.PIDController(
             rtol=self.rtol,
             atol=self.rtol,
@@ -365,14 +365,14 @@ class MomentSolver(NamedTuple):
         )
         rows, completed = integrate_at(
             # s = ln(1 + t): a power law of time takes the same number of steps each decade.
-            lambda s, rows: jnp.where(known, derivative(rows) * jnp.exp(s), 0.0),
-            jnp.where(known, first, 0.0),
+            lambda s, rows: jnp.where(inputs_finite, derivative(rows) * jnp.exp(s), 0.0),
+            jnp.where(inputs_finite, first, 0.0),
             jnp.log1p(times),
             solver=self.solver,
             controller=controller,
             max_steps=self.max_steps,
         )
-        finite = known & jnp.all(jnp.isfinite(rows))
+        finite = inputs_finite & jnp.all(jnp.isfinite(rows))
         fault = status.flag(status.MAX_STEPS_REACHED, ~completed)
         fault |= status.flag(status.NOT_FINITE, completed & ~finite)
         return jnp.where(fault == status.OK, rows, jnp.nan), fault

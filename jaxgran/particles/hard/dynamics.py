@@ -61,7 +61,7 @@ SPEED_MARGIN = 1.15
 """Bound on the speeds within a window, over the speed of the fastest sphere before it."""
 
 MAX_LISTED_PER_PARTICLE = 20
-"""Listed pairs per particle from which on the skin is shortened, as in dense clusters."""
+"""Listed pairs per particle above which the skin is shortened, as in dense clusters."""
 
 MIN_SKIN = 0.2
 """Skin in diameters below which it is not shortened."""
@@ -78,8 +78,8 @@ class HardState(NamedTuple):
         age: time since the last impact.
         regularised: impacts made elastic because they followed the last one too soon.
         window: length of the next window.
-        spin: of rough spheres, transformed where there is drag; None of smooth ones.
-        rotational_gain: gain of the energy of these spins since t = 0; None of smooth ones.
+        spin: of rough spheres, transformed where there is drag; None for smooth ones.
+        rotational_gain: gain of the energy of these spins since t = 0; None for smooth ones.
         key: of the random numbers of a drive, with the number of kicks made; None without a drive.
     """
 

@@ -52,7 +52,7 @@ class ImpactEvents(NamedTuple):
             velocity of the sphere.
         speed: its normal part.
         spin: sum of the (transformed) spins of both spheres; at a wall, the spin of the sphere.
-            None of smooth spheres.
+            None for smooth spheres.
         elastic: whether the impact is elastic and smooth.
     """
 
@@ -72,8 +72,8 @@ class ImpactEffect(NamedTuple):
     Attributes:
         kick: change of velocity.
         lost: translational energy lost, by each sphere half of what both lose.
-        spin_change: change of the (transformed) spin; None of smooth spheres.
-        rotational_gain: gain of the energy of these spins, half of it for each sphere; None of
+        spin_change: change of the (transformed) spin; None for smooth spheres.
+        rotational_gain: gain of the energy of these spins, half of it for each sphere; None for
             smooth spheres.
     """
 
@@ -174,7 +174,7 @@ def exchange_gains(
 
 
 MAX_ROUNDS = 100_000
-"""Rounds of independent impacts in one window from which on the run counts as stalled."""
+"""Rounds of independent impacts in one window at which the run counts as stalled."""
 
 
 class ImpactWork(NamedTuple):
@@ -183,7 +183,7 @@ class ImpactWork(NamedTuple):
     Attributes:
         paths: of the particles.
         dissipated: translational energy lost, half of it counted for each of two spheres.
-        rotational_gain: gain of the energy of the (transformed) spins; None of smooth spheres.
+        rotational_gain: gain of the energy of the (transformed) spins; None for smooth spheres.
         impacts: number of impacts of each particle on others.
         wall_impacts: number of impacts on walls of each particle; None without walls.
         regularised: number of impacts that were elastic because they followed too soon.

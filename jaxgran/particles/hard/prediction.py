@@ -36,9 +36,9 @@ class Paths(NamedTuple):
     Attributes:
         x: position, extrapolated back to the start of the window.
         v: velocity.
-        last: time of the last impact, from which on the path is valid; negative if the impact was
+        last: time of the last impact, where the path begins; negative if the impact was
             before the window.
-        spin: of rough spheres; None of smooth ones.
+        spin: of rough spheres; None for smooth ones.
     """
 
     x: Float[Array, "slots d"]

@@ -86,7 +86,7 @@ class SoftState(NamedTuple):
         refinement: factor by which steps are shorter than `SoftDynamics.steps_per_contact` says.
         num_good: number of blocks since the step was last changed.
         drift: sum of the relative energy errors of all blocks.
-        spin: of spheres with friction; None of smooth ones.
+        spin: of spheres with friction; None for smooth ones.
     """
 
     elastic: Float[Array, "replicas"]
