@@ -128,6 +128,7 @@ def fit(measurement=None, **options):
     return jaxgran.fit(measurement, progress=False, **options)
 
 
+STICKY = jaxgran.Rough(0.5, friction=0.0)
 HAFF = {"model": HaffLaw(), "free": ("coefficient",)}
 """A fit of `GRAINS` that compiles in no time."""
 
@@ -413,6 +414,11 @@ FITS = [
     ({"model": jaxgran.SoftSpheres(100, replicas=2, projection=None)}, "projection"),
     ({"model": SPHERES, "solver": optx.BFGS(1e-8, 1e-8)}, "solver must be a gradient transform"),
     ({"model": DSMC, "start": ELASTIC}, "start at dissipative_constant = 0.0"),
+    (
+        {"measurement": measured(gas=dataclasses.replace(GAS, surface=STICKY))}
+        | {"free": (A, "friction")},
+        "start at friction = 0.0",
+    ),
     (
         {"measurement": measured(gas=SPLINE), "model": DSMC, "free": "law"},
         "KineticTheory.. or a solver of optax",

@@ -188,7 +188,7 @@ def in_si(value: Any, unit: str = "") -> Any:
     try:
         converted = value.to(unit.replace("^", "**")) if unit else getattr(value, to_base)()
     except Exception as error:  # each library raises errors of its own
-        raise ValueError(f"expected a quantity in {unit}: {error}") from None
+        raise ValueError(f"expected a quantity in {unit or 'SI units'}: {error}") from None
     return converted.magnitude if hasattr(converted, "magnitude") else converted.value
 
 

@@ -34,7 +34,7 @@ def _whole_number(_: object, tokens: Sequence[Token]) -> int:
     text = tokens[0].value
     number = int(text) if text.lstrip("+-").isdigit() else float(text)
     if not (abs(number) < MAX_NUMBER and number == int(number)):
-        raise ValueError(f"must be a whole number below 2^63, got {text}")
+        raise ValueError(f"must be a whole number between -2^63 and 2^63, got {text}")
     return int(number)
 
 

@@ -263,7 +263,9 @@ def _read_scene(path: Path, until: float | None, fits_A: bool = False) -> Simple
     if until is not None:
         first = float(gas.mean_free_time) / 10
         if not first < until < float("inf"):
-            raise ValueError(f"--until must lie above {first:.3g} s, got {until:g}")
+            raise ValueError(
+                f"--until must lie above {first:.3g} s (mean free time / 10), got {until:g}"
+            )
         times = jnp.geomspace(first, until, NUM_POINTS)
     if times is None:
         raise ValueError(f"{path} has no times. Give the last one, in s, as --until.")

@@ -93,7 +93,7 @@ def read_experiment(path: Path) -> jaxgran.Measurement:
     if "rotational_temperature" in errors and gas.surface is None:
         raise ValueError("T_rot_err needs rough grains: give beta_t, or leave out T_rot_err")
     if "displacement" in errors and gas.container is not None:
-        raise ValueError("displacement is not known in this scene: leave its error out")
+        raise ValueError("msd_err: <dr^2> is not computed between walls. Leave out msd_err")
     times = times_of(experiment)
     ones = np.ones_like(times)
     planned: dict[str, Any] = {"times": times, "temperature": ones}

@@ -267,8 +267,9 @@ def _of_velocities(table: Table, onto: str) -> DropTest:
     if np.any(wrong := speed <= 0):
         i = int(np.argmax(wrong))
         raise ValueError(
-            f"line {table.lines[i]}: vx,vy,vz lead away from the partner; nx,ny,nz point from the "
-            "partner to the sphere, and the velocities are those before and after"
+            f"line {table.lines[i]}: vx,vy,vz lead away from the partner: reverse nx,ny,nz, "
+            "which point from the partner to the sphere, or exchange the velocities before and "
+            "after"
         )
     sideways = before + speed[:, None] * normal
     tangential = np.linalg.norm(sideways, axis=1)

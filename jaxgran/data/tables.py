@@ -550,6 +550,8 @@ def _factor(name: str, units_given: dict[str, str], units: dict[str, str], kind:
         return 1.0
     try:
         return unit_in(unit, base)
+    except UnitError as error:
+        raise ValueError(f"{kind} {name}: {error}") from None
     except Exception:  # pint raises errors of many types for text that is not a unit
         advice = f"write a unit such as {base}, or leave it out"
         if base == "m^2/s^2":
@@ -557,6 +559,10 @@ def _factor(name: str, units_given: dict[str, str], units: dict[str, str], kind:
         raise ValueError(
             f"{kind} {name}: {unit!r} is not known as a unit of {base}; {advice}"
         ) from None
+
+
+class UnitError(ValueError):
+    """A unit that is refused for a reason of its own."""
 
 
 def unit_in(unit: str, base: str) -> float:
@@ -568,10 +574,10 @@ def unit_in(unit: str, base: str) -> float:
     """
     text = re.sub(r"([A-Za-z])(\d)", r"\1^\2", unit.replace("**", "^"))
     if len(text) > MAX_UNIT or "^" in _POWER.sub("", text):
-        raise ValueError("units have powers of one digit")
+        raise UnitError(f"{unit!r} is not a unit of {base}: powers have one digit")
     parsed = _units().parse_units(text)
     if "pixel" in str(parsed):  # which pint takes for 1/96 inch
-        raise ValueError("a pixel is not a length")
+        raise UnitError(f"{unit!r} is not a unit of {base}: multiply by the metres of one pixel")
     factor = _units().Quantity(1.0, parsed).to("" if base == "1" else base).magnitude
     return float(f"{factor:.15g}")  # without the rounding errors of several factors
 

@@ -77,7 +77,7 @@ MESSAGES = {
     "scatters more": "the data scatter more about the model than their errors and N equal spheres "
     "allow: another effect, a mixture of sizes, eps that scatters, fewer grains than given, or "
     "noise of the measurement",
-    "as few": " (some {number:.2g} grains would scatter as much)",
+    "as few": " (some {number:g} grains would scatter as much)",
     "scatters less": "the curve scatters less than N equal spheres do: grains that walls cool, "
     "more grains than given, or a curve that was smoothed",
     "rising": "T rises from {first:.3g} to {last:.3g} m^2/s^2, and nothing drives this gas: "
@@ -87,7 +87,7 @@ MESSAGES = {
     "errors too large": "the residuals are smaller than the errors of T allow by chance: these "
     "errors are too large, or they are common to the points",
     "scatter of eps": "eps of the impacts scatters by {scatter:.2g} beyond its errors",
-    "scatter": "the curve scatters as {number:.3g} +- {error:.2g} grains do",
+    "scatter": "the curve scatters as {number:g} +- {error:g} grains do",
     "of each": "{label}: chi^2 is {chi2:.3g} for {number} points; its weight in {symbol} is "
     "{weight:.2f}",
     "assumptions": "the model assumes {all}",
@@ -101,11 +101,11 @@ MESSAGES = {
     "law is preferred": "{name}, {eps:.3g}, in place of the fitted law decreases -2 ln L by "
     "{improvement:.3g}, which happens by chance in less than 1 % of fits: A has no meaning then",
     "law is possible": "{name}, {eps:.3g}, in place of the fitted law cannot be excluded: A has no "
-    "meaning then; to exclude it, the errors must be {factor:.2g} times smaller",
+    "meaning then; to exclude it, the errors must be {factor:g} times smaller",
     "outside": "the estimate {estimate:.3g} lies outside of this range, because it assumes that "
     "the preferred alternative is absent",
     "is possible": "{name} cannot be excluded: with it {range}; to exclude it, the errors must be "
-    "{factor:.2g} times smaller",
+    "{factor:g} times smaller",
     "outliers": "far outliers at {places}: check them and their error bars",
     "without outliers": "; without them {symbol} is {value:.3g} +- {error:.2g}",
     "distant": "nearly every T differs from the fitted one by more than a factor of {ratio:g}: "
@@ -133,6 +133,11 @@ MESSAGES = {
 def say(name: str, /, **values: Any) -> str:
     """Return a sentence with its values, without blanks that empty values leave."""
     return MESSAGES[name].format(**values).replace("  ", " ").strip()
+
+
+def two_digits(x: float) -> float:
+    """Return a number rounded to two digits, which is then written without an exponent."""
+    return float(f"{x:.2g}")
 
 
 def with_words(
@@ -348,7 +353,7 @@ def _misfit(
     if scatters_more:
         as_few = ""
         if len(known) == len(result.measurements) == 1:
-            as_few = MESSAGES["as few"].format(number=known[0] / result.reduced_chi2)
+            as_few = MESSAGES["as few"].format(number=two_digits(known[0] / result.reduced_chi2))
         yield MESSAGES["scatters more"] + as_few
     if scatters_less:
         yield say("scatters less" if is_misfit else "errors too large")
@@ -360,7 +365,8 @@ def _scatter(result: Fit) -> Iterator[str]:
         if result.measurements[label].num_particles is None and error < 1.0:
             number = 1e3 / ratio
             prefix = f"{label}: " if label else ""
-            yield prefix + say("scatter", number=number, error=number * error)
+            error = number * error
+            yield prefix + say("scatter", number=two_digits(number), error=two_digits(error))
 
 
 def _of_each(result: Fit) -> Iterator[str]:
@@ -400,7 +406,7 @@ def _alternatives(result: Fit, absent: tuple[str, ...], quick: bool) -> Iterator
             "eps": alternative.restitution,
             "improvement": alternative.improvement,
             "range": _range(result, low, high),
-            "factor": alternative.error_reduction_needed,
+            "factor": two_digits(alternative.error_reduction_needed),
         }
         if alternative.preferred:
             yield say(f"{kind}is preferred", **words)

@@ -260,8 +260,6 @@ def _result(
             notes.append(NOT_COMPARED)
     if bias >= MIN_REPORTED_BIAS:
         notes.append(say("slopes", share=100 * bias))
-    if explanations is not None:
-        notes.append(say("of particles"))
     residuals = expansion.residuals
     rows = Residuals(
         "curve",

@@ -158,7 +158,9 @@ def check_volume(gas: Gas, num_particles: int) -> None:
     phi = float(gas.packing_fraction)
     share = container_volume_ratio(gas, num_particles)
     if abs(share - 1) > VOLUME_TOLERANCE:
-        ways = [f"enlarge the container {share:.4g} times"] if share > 1 else []
+        ways = (
+            [f"enlarge the volume of the container by the factor {share:.4g}"] if share > 1 else []
+        )
         if gas.domains["packing_fraction"].contains(phi * share):
             ways.append(f"set packing_fraction={phi * share:.4g}")
         if num_particles / share >= 2:
@@ -192,8 +194,8 @@ def limitations_of_instant_impacts(
     scales = scales_at(gas)
     if scales.contact_fraction > CONTACT_LIMIT:
         effects.append(
-            f"contacts last {scales.contact_fraction:.2g} of the mean free time, so spheres meet "
-            "three at a time"
+            f"contacts last {scales.contact_fraction:.2g} of the mean free time, so three spheres "
+            "are often in contact at once"
         )
     if scales.overlap > OVERLAP_LIMIT:
         effects.append(

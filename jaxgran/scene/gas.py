@@ -112,7 +112,7 @@ def optional_element(name: str) -> Any:
         if value is None or isinstance(value, classes):
             return value
         allowed = ", ".join(f"a jaxgran.{cls.__name__}" for cls in classes)
-        raise ValueError(f"expected {allowed} or None, got {value!r}")
+        raise ValueError(f"{name}: expected {allowed} or None, got {value!r}")
 
     return eqx.field(converter=check_class, default=None, kw_only=True)
 

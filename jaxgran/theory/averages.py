@@ -332,7 +332,7 @@ def rough_impact_means(
     S: Float[Array, "1 n"],
     V: Float[Array, "1 n"],
     m: Float[Array, "1 n"] | None,
-    kick: Float[Array, ""],
+    impulse: Float[Array, ""],
     eta: Float[Array, ""],
     inertia: Float[Array, ""],
     d: int,
@@ -350,7 +350,7 @@ def rough_impact_means(
         S: variance of the components of the relative velocity, the sum of the two T.
         V: variance of the components of the slip, the sum of S and of the two a.
         m: see `slip_moments`, with ``m = mu (1 + eps)/2 / eta sqrt(S/V)``; None without a limit.
-        kick: (1 + eps)/2.
+        impulse: (1 + eps)/2.
         eta: coefficient of `Rough`.
         inertia: q.
         d: dimension.
@@ -364,7 +364,7 @@ def rough_impact_means(
     r = 1 / inertia
     uJ, JJ, uuJJ, uuuJ, J4, uJ3, gguJ, ggJJ = slip_moments(m, d)
     z = eta * r
-    normal = kick * (kick * S - 2 * T)
+    normal = impulse * (impulse * S - 2 * T)
     of_v = eta * (eta * V * JJ - 2 * T * uJ)
     of_s = z * (z * V * JJ - 2 * a * uJ)
     rate = jnp.sqrt(S / 2)

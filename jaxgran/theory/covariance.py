@@ -51,7 +51,7 @@ from jaxgran.theory.averages import (
     rough_energy_moments,
 )
 from jaxgran.theory.density import Density
-from jaxgran.theory.elements import coulomb_limit, mean_kick
+from jaxgran.theory.elements import coulomb_limit, mean_impulse
 from jaxgran.theory.moments import Spins
 from jaxgran.theory.sizes import (
     PairRates,
@@ -177,14 +177,14 @@ class Impacts(NamedTuple):
     Attributes:
         rate: impacts over the number of particles and the unit of reduced time.
         loss, square: mean and mean square of the loss x, see `loss_moments`.
-        eta, kick: coefficient of `Rough`, and (1 + eps)/2, if the spheres are rough.
+        eta, impulse: coefficient of `Rough`, and (1 + eps)/2, if the spheres are rough.
     """
 
     rate: Any
     loss: Any
     square: Any
     eta: Any = None
-    kick: Any = None
+    impulse: Any = None
 
 
 def collisions(scene: ReducedScene, density: Density, speed: Array, mean: Mean, d: int) -> Impacts:
@@ -195,7 +195,7 @@ def collisions(scene: ReducedScene, density: Density, speed: Array, mean: Mean, 
     impacts = Impacts(rate, loss * factor, square * factor**2)
     if scene.surface is None:
         return impacts
-    return impacts._replace(eta=scene.surface.eta, kick=mean_kick(scene.law, speed))
+    return impacts._replace(eta=scene.surface.eta, impulse=mean_impulse(scene.law, speed))
 
 
 def wall_impacts(
@@ -223,7 +223,7 @@ def wall_impacts(
     eta = jnp.zeros_like(speed)
     if walls.surface is not None:
         eta = surface.eta_on_wall(walls.surface) / 2
-    return impacts._replace(eta=eta, kick=mean_kick(walls.law, speed / sqrt(2)))
+    return impacts._replace(eta=eta, impulse=mean_impulse(walls.law, speed / sqrt(2)))
 
 
 def energy_moments(
@@ -244,7 +244,7 @@ def energy_moments(
     rate, loss, square = impacts[:3]
     if surface is None:
         return jnp.reshape(-rate * loss / 2, 1), jnp.reshape(rate * square / 4, (1, 1))
-    m = coulomb_limit(surface, impacts.eta, impacts.kick, 1 + A / S)
+    m = coulomb_limit(surface, impacts.eta, impacts.impulse, 1 + A / S)
     more = S / 2  # the speed of impacts grows with the root of it
     losses = loss * more, square * more**2
     means, squares = rough_energy_moments(losses, m, impacts.eta, surface.inertia, S, A, d)

@@ -12,23 +12,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxgran.scene.elements import MAX_WALL_IMPACT_RATIO, NUM_SPIN_COMPONENTS, wall_impact_ratio
-from jaxgran.scene.gas import (
-    ReducedRough,
-    ReducedScene,
-    ReducedWalls,
-)
+from jaxgran.scene.gas import ReducedRough, ReducedScene, ReducedWalls
 from jaxgran.scene.geometry import impact_average
 from jaxgran.scene.laws import ReducedLaw
-from jaxgran.theory.averages import (
-    ElementBounds,
-    collision_rate,
-    rough_impact_means,
-)
+from jaxgran.theory.averages import ElementBounds, collision_rate, rough_impact_means
 from jaxgran.theory.moments import Spins
-from jaxgran.theory.sizes import (
-    drag_factors,
-    equal_rates,
-)
+from jaxgran.theory.sizes import drag_factors, equal_rates
 
 SUPPORTED = ("surface", "container", "drag", "drive", "diameter_sd")
 """Elements of a scene that the equations contain, see `Gas.elements`."""
@@ -71,10 +60,12 @@ def element_rates(
     zero = jnp.zeros_like(speed)
     spins = spins or Spins.gaussian(zero)
     parts = [ElementRates(zero)]
-    if (surface := scene.surface) is not None:
-        kick = mean_kick(scene.law, speed)
+    surface = scene.surface
+    drag = scene.drag
+    if surface is not None:
+        impulse = mean_impulse(scene.law, speed)
         changes = rough_impact_rates(
-            surface, surface.eta, kick, spins, sonine, dimension, gaussian=gaussian_spins
+            surface, surface.eta, impulse, spins, sonine, dimension, gaussian=gaussian_spins
         )
         # The means over spins that are not Gaussian contain the effect of a_2.
         rate = collision_rate(sonine if gaussian_spins else 0.0, dimension) * speed
@@ -82,7 +73,7 @@ def element_rates(
     if scene.walls is not None:
         on_walls = _wall_rates(scene.walls, surface, speed, spins, sonine, dimension)
         parts.append(on_walls)
-    if (drag := scene.drag) is not None:
+    if drag is not None:
         parts.append(ElementRates(2 * drag.rate, spins.damped(2 * drag.rotational_rate), drag.rate))
     if scene.drive is not None:
         heating = scene.drive / speed**2
@@ -95,8 +86,11 @@ TYPICAL_IMPACT = 2 * sqrt(2 / pi)
 """Mean normal speed of impacts, weighted by itself, in units of sqrt(2 T)."""
 
 
-def mean_kick(law: ReducedLaw, speed: Float[Array, "*points"]) -> Float[Array, "*points"]:
-    """Return (1 + eps)/2 at the typical impact; within 2 % for sliding spheres of ice."""
+def mean_impulse(law: ReducedLaw, speed: Float[Array, "*points"]) -> Float[Array, "*points"]:
+    """Return (1 + eps)/2 of the typical impact: the normal impulse over m times the normal speed.
+
+    The cooling of sliding spheres of ice is then right within 2 %.
+    """
     return (1 + law.restitution(TYPICAL_IMPACT * speed)) / 2
 
 
@@ -120,30 +114,30 @@ _STENCIL = np.array(
         [0, 0, 0, 0.5, -0.5, 0.5, -0.5, -1, 1],
     ]
 )[:, None]
-"""Steps in T and a, and weights of the differences d_TT, d_Ta, d_aa and d_Taa."""
+"""Steps in T and a, and weights of the differences d_TT, d_Ta, d_aa and d_Taa at these steps."""
 
 
 def coulomb_limit(
-    surface: ReducedRough, eta: Array, kick: Array, variance: Array
+    surface: ReducedRough, eta: Array, impulse: Array, variance: Array
 ) -> Float[Array, "..."] | None:
     """Return m of `slip_moments`, ``mu (1 + eps)/2 / (eta sqrt(V/S))``; None without friction.
 
     Args:
         surface: in reduced units.
         eta: coefficient of `Rough`.
-        kick: (1 + eps)/2, see `mean_kick`.
+        impulse: (1 + eps)/2, see `mean_impulse`.
         variance: V/S, of a component of the slip over one of the relative velocity.
     """
     if surface.friction is None:
         return None
     slip = jnp.sqrt(variance) * jnp.maximum(eta, 1e-9)
-    return jnp.minimum(surface.friction * kick / slip, MAX_STICKING)
+    return jnp.minimum(surface.friction * impulse / slip, MAX_STICKING)
 
 
 def rough_impact_rates(
     surface: ReducedRough,
     eta: Float[Array, ""],
-    kick: Float[Array, ""],
+    impulse: Float[Array, ""],
     spins: Spins,
     sonine: Float[Array, ""],
     d: int,
@@ -159,7 +153,7 @@ def rough_impact_rates(
     differences. Products of cumulants of two spheres are left out, and directions of v and s are
     taken to be independent.
 
-    Spheres stick where eta times the slip is below mu times the normal kick ``(1 + eps)/2 g``.
+    Spheres stick where eta times the slip is below ``mu (1 + eps)/2 g``.
 
     References: Huthmann & Zippelius, Phys. Rev. E 56, R6275 (1997), for Gaussian spins; Santos,
     Kremer & dos Santos, Phys. Fluids 23, 030604 (2011), for cumulants, named as there, of spheres
@@ -168,39 +162,49 @@ def rough_impact_rates(
     Args:
         surface: in reduced units.
         eta: coefficient of `Rough`.
-        kick: (1 + eps)/2, see `mean_kick`.
+        impulse: (1 + eps)/2, see `mean_impulse`.
         spins: moments of the spins.
         sonine: a_2.
         d: dimension.
         gaussian: take v and s to be Gaussian.
     """
-    q, num_spins = surface.inertia, NUM_SPIN_COMPONENTS[d]
-    a, correlation, kurtosis = spins.rotation / q, spins.correlation / q, spins.kurtosis / q**2
-    # A pair of spheres at each step of the first: sums over both.
+    q = surface.inertia
+    num_spins = NUM_SPIN_COMPONENTS[d]
+    a = spins.rotation / q
+    correlation = spins.correlation / q
+    kurtosis = spins.kurtosis / q**2
+    # The first sphere of a pair has the variances of a step of the stencil, the second one 1 and a.
     stencil = jnp.asarray(_STENCIL[:, :, : 1 if gaussian else None], a.dtype)
     step_T, step_a, of_TT, of_Ta, of_aa, of_Taa = stencil
-    size_T, size_a = 2 * _STEP, 2 * _STEP * (1 + a)
-    T1, a1 = 1 + size_T * step_T, a + size_a * step_a
-    T, of_spin = (jnp.concatenate([x, jnp.full_like(x, y)]) for x, y in ((T1, 1.0), (a1, a)))
+    size_T = 2 * _STEP
+    size_a = 2 * _STEP * (1 + a)
+    T1 = 1 + size_T * step_T
+    a1 = a + size_a * step_a
+    T = jnp.concatenate([T1, jnp.ones_like(T1)])
+    variance_of_spin = jnp.concatenate([a1, jnp.full_like(a1, a)])
     S = 1 + T1
     V = 1 + T1 + a + a1
-    m = coulomb_limit(surface, eta, kick, V / S)
-    means = rough_impact_means(T, of_spin, S, V, m, kick, eta, q, d, gaussian)
+    m = coulomb_limit(surface, eta, impulse, V / S)
+    means = rough_impact_means(T, variance_of_spin, S, V, m, impulse, eta, q, d, gaussian)
+    # Sums over both spheres: each mean counts half.
     weights = jnp.zeros_like(T1).at[0, 0].set(0.5)
     if not gaussian:
-        weights += sonine / (2 * size_T**2) * of_TT + correlation / (size_T * size_a) * of_Ta
+        weights += sonine / (2 * size_T**2) * of_TT
+        weights += correlation / (size_T * size_a) * of_Ta
         weights += kurtosis / (2 * size_a**2) * of_aa
-        third = A12 * correlation * kurtosis * a / jnp.maximum(a**2, 1e-12)
-        weights += third / (2 * size_T * size_a**2) * of_Taa
-    of_v, by_normal, slipping, of_s, *of_cumulants = (jnp.sum(x * weights) for x in means)
-    spinning = of_s / num_spins
-    turned = spreading = jnp.zeros_like(of_s)
+        a12 = A12 * correlation * kurtosis * a / jnp.maximum(a**2, 1e-12)
+        weights += a12 / (2 * size_T * size_a**2) * of_Taa
+    v2, v2_by_normal, slipping, s2, *products = (jnp.sum(x * weights) for x in means)
+    rotation = s2 / num_spins
+    correlation_rate = jnp.zeros_like(s2)
+    kurtosis_rate = jnp.zeros_like(s2)
     if not gaussian:
-        of_vs, of_ss = of_cumulants
-        cooling = -(of_v + by_normal) / d
-        turned = of_vs / (d * num_spins) - spinning + (a + correlation) * cooling
-        spreading = of_ss / (num_spins * (num_spins + 2)) - 2 * a * spinning
-    return ElementRates(-of_v / d, Spins(q * spinning, q * turned, q**2 * spreading), slipping / d)
+        v2s2, s4 = products
+        cooling = -(v2 + v2_by_normal) / d
+        correlation_rate = v2s2 / (d * num_spins) - rotation + (a + correlation) * cooling
+        kurtosis_rate = s4 / (num_spins * (num_spins + 2)) - 2 * a * rotation
+    changes = Spins(q * rotation, q * correlation_rate, q**2 * kurtosis_rate)
+    return ElementRates(-v2 / d, changes, slipping / d)
 
 
 def _wall_rates(
@@ -251,8 +255,8 @@ def _wall_rates(
         if surface is None or walls.surface is None:
             return ElementRates(cooling, sonine=a2_rate)
         eta = surface.eta_on_wall(walls.surface) / 2
-        kick = mean_kick(walls.law, speed / sqrt(2))
-        changes = rough_impact_rates(surface, eta, kick, spins, sonine, d, gaussian=True)
+        impulse = mean_impulse(walls.law, speed / sqrt(2))
+        changes = rough_impact_rates(surface, eta, impulse, spins, sonine, d, gaussian=True)
         impacts = 2 * frequency * impact_average(share, speed)
         changes = jax.tree.map(lambda change: impacts * change, changes)
         return changes._replace(cooling=cooling + changes.cooling, sonine=a2_rate)
@@ -276,15 +280,22 @@ def element_bounds(scene: ReducedScene, dimension: int) -> ElementBounds:
         by a drive, None where nothing heats; T/T_0 that a gas could gain from the spins, None for
         smooth spheres.
     """
-    by_speed, constant, heating, rotation = 0.0, 0.0, None, None
-    surface, walls, d, rate = scene.surface, scene.walls, dimension, collision_rate(0.0, dimension)
+    d = dimension
+    rate = collision_rate(0.0, d)
+    surface = scene.surface
+    walls = scene.walls
+    by_speed = 0.0
+    constant = 0.0
+    heating = None
+    rotation = None
 
     def friction(surface: ReducedRough, eta: Array, rate: Array) -> Array:
         return rate * 2 * (d - 1) / d * (eta - eta**2)
 
     if surface is not None:
         by_speed = by_speed + friction(surface, surface.eta, rate)
-        heating, rotation = jnp.zeros(()), NUM_SPIN_COMPONENTS[d] / d * surface.ratio
+        heating = jnp.zeros(())
+        rotation = NUM_SPIN_COMPONENTS[d] / d * surface.ratio
     if walls is not None:
         frequency = walls.frequency / rate
         share = wall_impact_ratio(jnp.zeros_like(frequency), frequency, d)
@@ -300,7 +311,8 @@ def element_bounds(scene: ReducedScene, dimension: int) -> ElementBounds:
         one = jnp.ones_like(scene.sizes.spread)
         by_speed = by_speed - equal_rates(scene.law, one, 0.0, d)
         small, large = scene.sizes.masses
-        heating, rotation = jnp.zeros(()), (large - small) / (2 * small)
+        heating = jnp.zeros(())
+        rotation = (large - small) / (2 * small)
         if scene.drag is not None:
             constant = constant * drag_factors(scene.sizes)[0]
     if scene.drive is not None:

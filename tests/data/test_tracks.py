@@ -82,6 +82,11 @@ def test_impacts_between_frames_are_corrected(read):
     # Uncorrected T is 17 % too small; 9000 components: sqrt(2/9000) = 1.5 %, three of it.
     np.testing.assert_allclose(curve.temperature, 0.01, rtol=0.045)
     assert "corrected, at most 17 % of T" in header["T_from"]
+    # The rate of impacts depends on the diameter and on eta, not on the law.
+    keys = {"eta": 0.05, "diameter": 0.002, "eps": 0.9}
+    same, of_eps = read(text_of(times, np.array(positions), N=n, **keys))
+    np.testing.assert_array_equal(same.temperature, curve.temperature)
+    assert of_eps["T_from"] == header["T_from"]
 
 
 CASES = [

@@ -42,7 +42,7 @@ def test_dense_measured_curve_is_not_explained():
     assert result.grade == "not consistent"
     assert "needs soft spheres" in result.verdict
     text = " ".join(result.reasons)
-    for word in ("reduced chi^2", "three at a time", "overlap", "above L_c"):
+    for word in ("reduced chi^2", "three spheres are often in contact", "overlap", "above L_c"):
         assert word in text
 
 

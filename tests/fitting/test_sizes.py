@@ -70,6 +70,9 @@ def test_a_file_gives_the_spread_and_the_mean_mass(tmp_path, curve):
     path.write_text("\n".join([*lines, "t,energy", *rows]))
     measurement = jaxgran.read_measurement(path)
     assert measurement.of_energy
+    copy = tmp_path / "copy.csv"
+    jaxgran.write_curve(copy, measurement.curve, dict(measurement.header))
+    assert jaxgran.read_measurement(copy).of_energy
     assert float(measurement.gas.value("diameter_sd")) == pytest.approx(0.3e-3)
     np.testing.assert_allclose(measurement.curve.temperature, curve.temperature, rtol=1e-6)
 
