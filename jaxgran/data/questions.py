@@ -68,7 +68,7 @@ MAX_ERROR_RATIO = 10.0
 
 QUESTIONS = {
     # units
-    "unusual": "{name} is {value:.6g} {base}; usual values are {low:g} to {high:g}: {question}",
+    "unusual": "{name} is {value:.6g} {base}, where usual values are {low:g} to {high:g}: {question}",
     "any unit": "check its unit",
     "any unit of T": "check its unit (kelvin times 1.38e-23 J/K over the mass are m^2/s^2)",
     "unit of a key": "is it in {unit}? Then write {name}: {in_si:.6g}, or {name}: {value:g} {unit}",
@@ -89,7 +89,7 @@ QUESTIONS = {
     "does the clock of the file start earlier than the gas? Then subtract that time, or fit it: "
     "--free A t0",
     "loss": "T falls to a half in {halving:.3g} mean free times of the header's gas (eta, "
-    "diameter, T0); usual values are {low:.2g} to {high:.2g}: {question}",
+    "diameter, T0), where usual values are {low:.2g} to {high:.2g}: {question}",
     "unit of t": "is t in {units}? Then name the column t ({unit})",
     "any unit of the header": "are t, eta, diameter and T0 in the units that the file says?",
     "steps": "; is it in steps or frames? Then multiply it by their duration",
