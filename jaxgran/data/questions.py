@@ -68,7 +68,8 @@ MAX_ERROR_RATIO = 10.0
 
 QUESTIONS = {
     # units
-    "unusual": "{name} is {value:.6g} {base}, where usual values are {low:g} to {high:g}: {question}",
+    "unusual": "{name} is {value:.6g} {base}, where usual values are {low:g} to {high:g}: "
+    "{question}",
     "any unit": "check its unit",
     "any unit of T": "check its unit (kelvin times 1.38e-23 J/K over the mass are m^2/s^2)",
     "unit of a key": "is it in {unit}? Then write {name}: {in_si:.6g}, or {name}: {value:g} {unit}",
