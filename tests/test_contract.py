@@ -467,7 +467,7 @@ class TestContract:
         assert "range" in jaxgran.explain_status(int(along[0].status[2]))
         assert np.all(np.isnan(along[0].temperature[2]))
 
-    @pytest.mark.slow
+    @pytest.mark.minutes
     @of_models(has_positions)
     def test_a_batch_outside_of_jit_is_compiled_once(self, case, caplog):
         model = dataclasses.replace(case.model.sized_for(case.gas), start=case.start)

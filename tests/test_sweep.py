@@ -199,7 +199,7 @@ def test_gases_share_one_search_for_pairs():
     assert both._sizes.capacity.lookahead == cells._sizes.capacity.lookahead
 
 
-@pytest.mark.slow  # programs of particles are compiled
+@pytest.mark.minutes  # programs of particles are compiled
 def test_a_chunk_is_run_again_if_a_member_overflows_its_arrays(monkeypatch):
     module = sys.modules["jaxgran.sweep"]
     sized_for_all = module._sized_for_all
@@ -223,7 +223,7 @@ def test_a_chunk_is_run_again_if_a_member_overflows_its_arrays(monkeypatch):
     np.testing.assert_array_equal(curves(0.5, 2.0).temperature, whole.temperature)
 
 
-@pytest.mark.slow  # a program of particles is compiled
+@pytest.mark.minutes  # a program of particles is compiled
 def test_particles_with_positions(tmp_path):
     xarray = pytest.importorskip("xarray")
     options = {"model": jaxgran.HardSpheres(50, replicas=2), "save": "particles"}

@@ -44,7 +44,7 @@ def check(store, expected):
     assert not np.any(stored.status)
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 def test_a_sweep_is_resumed_after_a_process_was_killed(tmp_path, expected):
     store = tmp_path / "sweep.zarr"
     codes, chunks, outputs = run(2, store, 10, die_at=3)

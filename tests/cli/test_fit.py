@@ -35,6 +35,7 @@ def assert_finds_A(answer):
     assert abs(answer["A"] / 3e-6 - 1) < 3 * answer["A_std_err"] / 3e-6 < 0.1
 
 
+@pytest.mark.slow
 def test_several_measurements_are_fitted_jointly(measured, fit):
     out, answer = fit("thin.csv", "dense.csv", "--drop-test", "drops.csv")
     assert_finds_A(answer)
@@ -55,6 +56,7 @@ def test_a_contradicting_drop_test_is_reported(fit):
     assert "contradict each other, or the model" in out
 
 
+@pytest.mark.slow
 def test_errors_of_headers_are_priors_of_joint_fits(measured, fit):
     """What is of the material is known once, what is of a curve for each."""
     for name in ("thin.csv", "dense.csv"):
@@ -68,6 +70,7 @@ def test_errors_of_headers_are_priors_of_joint_fits(measured, fit):
     assert budget["packing_fraction"] > 0 and budget["few particles"] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("free", [("A",), ("A", "T0")])
 def test_late_clocks_of_headers_are_priors_of_joint_fits(fit, free):
     for name in ("thin.csv", "dense.csv"):

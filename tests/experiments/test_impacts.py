@@ -93,7 +93,7 @@ def test_many_rows_take_seconds(filmed):
     assert (time.perf_counter() - begin) / columns["t"].size < 5 / 1e5
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 def test_tracks_and_their_impacts_are_fitted_together():
     film = study.film(study.beads(surface=jaxgran.Rough(-0.3)), 250, seed=2, number=100)
     joint = study.joint_fit(film, 4e-5, seed=3)

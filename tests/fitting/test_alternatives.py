@@ -278,6 +278,7 @@ def test_eps_that_scatters_is_an_alternative():
     assert in_range(result, gas.value(A))
 
 
+@pytest.mark.slow
 def test_no_alternative_is_preferred_where_all_is_told():
     gas = glass_beads(0.1)
     for seed in range(5):

@@ -45,6 +45,7 @@ def test_roughness_and_A_are_found_together(model):
     assert in_range(result, gas.value(A))  # with beta_t free there is a range, too
 
 
+@pytest.mark.slow
 def test_of_two_minima_in_beta_t_the_deeper_one_is_found_and_said_where_as_deep():
     # Rotation takes most energy at some beta_t: on both sides of it T and T_rot look alike, with
     # half of A on the other side.

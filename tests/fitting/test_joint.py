@@ -94,6 +94,7 @@ def test_a_restitution_that_is_flat_is_not_viscoelastic():
     assert jaxgran.fit(of_drops(constant, test)).p_value > 0.01
 
 
+@pytest.mark.slow
 def test_curves_and_drops_together():
     dilute = glass_beads(0.15)
     dense = dilute.replace(packing_fraction=0.15)

@@ -150,7 +150,7 @@ def test_what_makes_no_experiment_is_refused(measurement, options, message):
         jaxgran.plan(measurement, **options)
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 def test_plan_is_the_fit_of_noise_free_curves():
     def as_it_is(m):
         return m

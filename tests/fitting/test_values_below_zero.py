@@ -34,7 +34,7 @@ def test_values_below_zero_leave_A_unbiased():
     assert 0.6 < scatter / errors.mean() < 1.5  # 20 seeds: 16 %
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 def test_values_below_zero_are_fitted():
     curve = noisy(0)
     assert np.sum(curve.temperature < 0) > 5

@@ -36,7 +36,7 @@ def test_a_checkpoint_that_cannot_be_written_is_told_before_the_run(tmp_path):
             cool(model=SOFT, checkpoint=path)
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 @pytest.mark.parametrize("kind", [jaxgran.HardSpheres, jaxgran.DSMC])
 def test_single_precision_has_no_trend(kind):
     model = kind(50, replicas=32)
@@ -63,7 +63,7 @@ def test_single_precision_has_no_trend(kind):
     [
         jaxgran.KineticTheory(),
         DSMC,
-        pytest.param(jaxgran.HardSpheres(20), marks=pytest.mark.slow),
+        pytest.param(jaxgran.HardSpheres(20), marks=pytest.mark.minutes),
         pytest.param(SOFT, marks=pytest.mark.slow),
     ],
 )

@@ -146,6 +146,7 @@ def test_each_of_a_few_particles_meets_the_others():
     assert abs(rate - (1 - 0.5 / n)) < 0.01
 
 
+@pytest.mark.slow
 def test_collisions_scatter_as_a_poisson_process():
     # An elastic gas of constant T. A third of the candidates collide: with steps of fixed length
     # the ratio would be .68.

@@ -31,7 +31,7 @@ CASES = {
 """Model, gas, parameter, and whether members share an array."""
 
 
-OFTEN = "list of numbers, hard", "A, soft"
+OFTEN = ("list of numbers, hard",)
 
 
 @pytest.mark.parametrize(

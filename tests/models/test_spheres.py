@@ -179,6 +179,7 @@ def test_heavily_damped_impacts_end():
     np.testing.assert_allclose(soft.dissipated_energy, hard.dissipated_energy, rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", [HardSpheres(40, replicas=2), SoftSpheres(40, replicas=2)])
 def test_runs_of_one_search_equilibrate_once(model, monkeypatch):
     """They begin at the same places, with new velocities, whatever A is."""
