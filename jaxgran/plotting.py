@@ -119,7 +119,7 @@ def plot_fit(result: Fit, axes: Any = None) -> np.ndarray:
     _draw_fit(axes, result, "temperature")
     curve = _measured(result)
     T = np.asarray(curve.temperature)[above_noise(curve)]
-    axes[0].set_ylim(0.6 * float(T[-1]), 1.6 * float(T.max()))
+    axes[0].set_ylim(0.6 * float(np.min(T)), 1.6 * float(T.max()))
     _draw_power_laws(axes[0], result.curve)
     axes[0].legend(frameon=False, loc="lower left")
     return axes

@@ -150,6 +150,17 @@ SCENES = [
     (lambda: gas_with(law=0.9), "law must be a restitution law"),
     (lambda: GRAINS.replace(temprature=1.0), "Gas has no parameter 'temprature'; it has coef"),
     (lambda: GRAINS.replace(packing_fraction=0.9), "packing_fraction must lie in"),
+    (
+        lambda: jaxgran.steady_state(
+            gas_with(drive=jaxgran.WhiteNoise(1e-3), surface=jaxgran.Frictional(0.5, 0.5))
+        ),
+        "steady state of a gas with friction is not known",
+    ),
+    (lambda: cool(between_walls().replace(wall_side=1.25 * GAS.diameter)), r"must lie in \(2.1"),
+    (
+        lambda: cool(gas_with(surface=jaxgran.Rough(0.5, rotational_temperature=1e6))),
+        "overlap by .* to which the gas heats up",
+    ),
     (lambda: GRAINS.delta, "delta belongs to the Viscoelastic law"),
     (lambda: jaxgran.sphere_mass(-1.0, 2500.0), "diameter"),
     # laws

@@ -136,6 +136,8 @@ def read_all(paths: Sequence[Path], options: FitOptions) -> dict[str, jaxgran.Me
     given = parse_settings(options.set)
     measurements: dict[str, jaxgran.Measurement] = {}
     drops = {"onto": "plate"} if options.onto_plate else {}
+    if options.onto_plate and not options.drop_test:
+        raise ValueError("--onto-plate belongs to --drop-test, which is not given.")
     is_single = len(paths) + len(options.drop_test) == 1 and not options.impacts
     for path in (*paths, *options.drop_test):
         label = path.stem if path.stem not in measurements else str(path)
@@ -179,8 +181,9 @@ def parameters_of(
     """Return the arguments `free` and `separate` of the fit."""
     is_single = [*measurements] == [""]
     free = options.free or (() if is_single else (_constant_of(measurements), "T0"))
-    if free and "A" not in free:
-        for measurement in measurements.values():
+    of_curves = [m for m in measurements.values() if not isinstance(m.data, DropTest)]
+    if free and not {"A", "eps"} & {*free}:
+        for measurement in of_curves or measurements.values():
             if not {"A", "eps"} & dict(measurement.header).keys():
                 raise ValueError(
                     f"--free {' '.join(free)} leaves A fixed, and the file does not give it. Add "

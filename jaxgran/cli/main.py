@@ -16,13 +16,24 @@ from cyclopts import App, CycloptsError, Parameter
 
 import jaxgran
 from jaxgran.cli import common
-from jaxgran.data.files import check_writable, header_count, name_in_errors
-from jaxgran.data.header import gas_of_header
+from jaxgran.data.curve_file import CSV_SUFFIXES
+from jaxgran.data.files import check_writable, header_count, header_number, name_in_errors
+from jaxgran.data.header import gas_of_header, guesses_of_header
 from jaxgran.data.scene_file import read_scene_file
+from jaxgran.data.tracks import TRACK_KEYS
+from jaxgran.models.checks import check_volume
 from jaxgran.models.choose import NUM_PARTICLES, default_models
+from jaxgran.scene.elements import container_volume_ratio
+from jaxgran.scene.parameters import symbol_of
 
 NUM_POINTS = 50
 """Number of times of a curve that is computed for --until."""
+
+OF_MEASUREMENTS = (
+    *("T_from", "T_of", "tracked", "T_scale_err", "errors", "T0_of", "t0", "t0_err"),
+    *TRACK_KEYS,
+)
+"""Header keys of a measured curve that do not hold for a computed one."""
 
 
 APP = App(
@@ -178,6 +189,8 @@ def cool(
     picture = out.with_suffix(".png")
     if picture == out:
         raise ValueError(f"--out must not end in .png, got {out}. The picture is named after it.")
+    if out.suffix not in (".npz", *CSV_SUFFIXES):
+        raise ValueError(f"--out must end in .csv or .npz, got {out}.")
     given = _read_scene(scene, until)
     for file in (out, picture):
         if file.exists() and not overwrite:
@@ -187,9 +200,10 @@ def cool(
 
     size = next(n for n in (particles, given.size, NUM_PARTICLES) if n is not None)
     chosen = common.models_by_name(default_models(size, replicas))[model]
+    if chosen.stochastic:
+        check_volume(given.gas, size)
     curve = jaxgran.cool(given.gas, given.times, model=chosen, key=jax.random.key(key))
-    # T is now that of velocities, whatever column it was read from.
-    header = {key: x for key, x in given.header.items() if key not in ("T_from", "T_of")}
+    header = {key: x for key, x in given.header.items() if key not in OF_MEASUREMENTS}
     if chosen.stochastic:  # a later fit takes its error budget from them
         header |= {"N": str(size), "replicas": str(replicas)}
     jaxgran.write_curve(out, curve, header, overwrite=overwrite)
@@ -237,6 +251,7 @@ def _read_scene(path: Path, until: float | None, fits_A: bool = False) -> Simple
         fits_A: whether A is fitted where a curve has none.
     """
     times = None
+    t0 = 0.0
     if path.suffix == ".toml":
         with name_in_errors(path):
             header, _ = read_scene_file(path)
@@ -247,7 +262,8 @@ def _read_scene(path: Path, until: float | None, fits_A: bool = False) -> Simple
         measurement = jaxgran.read_measurement(path)
         header = dict(measurement.header)
         gas = measurement.gas
-        times = measurement.curve.times
+        t0 = header_number({"t0": "0"} | header, "t0")
+        times = measurement.curve.times - t0
         if not {"A", "eps"} & header.keys() and fits_A:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # on the fit
@@ -260,6 +276,9 @@ def _read_scene(path: Path, until: float | None, fits_A: bool = False) -> Simple
             f"{path} does not give A, in s, or eps, a constant restitution. Add one, or estimate A "
             "with jaxgran fit."
         )
+    if guesses := guesses_of_header(header):
+        symbols = ", ".join(map(symbol_of, guesses))
+        raise ValueError(f"{path}: {symbols} is a guess. Give its value.")
     if until is not None:
         first = float(gas.mean_free_time) / 10
         if not first < until < float("inf"):
@@ -269,5 +288,11 @@ def _read_scene(path: Path, until: float | None, fits_A: bool = False) -> Simple
         times = jnp.geomspace(first, until, NUM_POINTS)
     if times is None:
         raise ValueError(f"{path} has no times. Give the last one, in s, as --until.")
+    if times[0] < 0:
+        raise ValueError(
+            f"{path}: the gas began at t0 = {t0:g} s, after the first time. Correct t0."
+        )
     size = header_count(header, "N")
+    if size is None and gas.container is not None:
+        size = round(1 / container_volume_ratio(gas, 1))
     return SimpleNamespace(gas=gas, times=times, size=size, header=header)

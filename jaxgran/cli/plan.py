@@ -15,13 +15,9 @@ from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.cli.fit import as_json, parse_settings
 from jaxgran.cli.page import command_of, question_of, sections_of_plan, write_page
 from jaxgran.data.curve import import_extra
-from jaxgran.data.files import check_writable, header_count, name_in_errors, write_atomically
-from jaxgran.data.header import (
-    absent_of_header,
-    gas_of_header,
-    guesses_of_header,
-    priors_of_header,
-)
+from jaxgran.data.files import check_writable, name_in_errors, write_atomically
+from jaxgran.data.header import gas_of_header
+from jaxgran.data.measurement_file import arguments_of_header
 from jaxgran.data.scene_file import errors_of, read_scene_file, times_of
 from jaxgran.fitting.twins import twin
 
@@ -102,18 +98,9 @@ def read_experiment(path: Path) -> jaxgran.Measurement:
         planned[f"{name}_error"] = error * ones
     planned["status"] = np.zeros((), int)
     curve = jaxgran.CoolingCurve(**as_jax_arrays(planned))
-    measurement = jaxgran.Measurement(
-        gas,
-        curve,
-        num_particles=header_count(header, "N"),
-        replicas=header_count(header, "replicas") or 1,
-        priors=priors_of_header(header),
-        absent=absent_of_header(header),
-        guesses=guesses_of_header(header),
-        errors_measured="temperature" in errors,
-        header=tuple(header.items()),
-    )
-    return twin(measurement)
+    arguments = arguments_of_header(header)
+    arguments["errors_measured"] |= "temperature" in errors
+    return twin(jaxgran.Measurement(gas, curve, **arguments))
 
 
 def details_of(planned: jaxgran.Plan) -> dict[str, Any]:

@@ -262,19 +262,29 @@ class CoolingCurve(eqx.Module):
                 column or the index.
 
         Raises:
-            ValueError: for a column that is neither.
+            ValueError: for a column that is neither, two columns of one quantity, or no times.
 
         >>> again = jaxgran.CoolingCurve.from_pandas(curve.to_pandas())
         >>> bool(jnp.all(again.temperature == curve.temperature))
         True
         """
         known = {quantity.column: name for name, quantity in QUANTITIES.items()}
-        columns = frame if {"t", "times"} & {*frame.columns} else frame.reset_index(names="times")
+        columns = frame
+        if not {"t", "times"} & {*frame.columns}:
+            if type(frame.index).__name__ == "RangeIndex":
+                raise ValueError(
+                    "the table has no times: name their column t, or make it the index"
+                )
+            columns = frame.reset_index(names="times")
         fields = {str(known.get(name, name)): columns[name].to_numpy() for name in columns.columns}
         if unknown := [name for name in fields if name not in QUANTITIES]:
             raise ValueError(
                 f"the column {unknown[0]} is not of a curve: rename or drop it. Known are "
                 f"{', '.join(known)}, and the names of the fields of CoolingCurve"
+            )
+        if len(fields) < len(columns.columns):
+            raise ValueError(
+                f"two of the columns {', '.join(columns.columns)} are the same quantity: keep one"
             )
         return cls(**fields)
 

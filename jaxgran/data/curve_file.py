@@ -26,6 +26,7 @@ from jaxgran.data.drop_test_file import drop_test_columns, drop_test_of_table, i
 from jaxgran.data.header import checked_header, gas_or_none, missing_keys
 from jaxgran.data.questions import ask_about_columns, ask_about_speeds, scene_of
 from jaxgran.data.tables import (
+    UNIT_KEYS,
     Table,
     header_entry,
     header_in_si,
@@ -114,9 +115,14 @@ def read_data(path: Path, given: dict[str, str]) -> Content:
     """
     if path.suffix == ARCHIVE_SUFFIX:
         curve, header = _read_archive(path)
-        header = header_in_si(header | given)
+        header = header_in_si(header) | header_in_si(given)
         return Content(curve, header, list(ask_about_columns(curve, header, gas_or_none(header))))
     if tracks.is_trajectory(path):
+        if units := UNIT_KEYS.keys() & given.keys():
+            raise ValueError(
+                f"{', '.join(units)}: the units of a trajectory stand in the file itself (units or "
+                "ITEM: UNITS); write units behind the other values, as in {'diameter': '2 mm'}"
+            )
         curve, header = tracks.curve_of_trajectory(path, header_in_si(given))
         return Content(curve, header, list(ask_about_columns(curve, header, gas_or_none(header))))
     table = read_table(path, WANTED, _columns_to_read, given, tracks.IDENTITIES)

@@ -190,7 +190,9 @@ def _speeds_of_angles(table: Table) -> dict[str, Any]:
     return speeds | {
         "speed_error": normal_error,
         "tangential_speed_error": tangential_error,
-        "tangential_correlation": covariance / np.where(product > 0, product, 1.0),
+        "tangential_correlation": np.clip(
+            covariance / np.where(product > 0, product, 1.0), -1.0, 1.0
+        ),
     }
 
 
@@ -249,7 +251,7 @@ def _of_velocities(table: Table, onto: str) -> DropTest:
             if table.units[name] in AMBIGUOUS_UNITS:
                 raise ValueError(
                     f"column {name} is an angular velocity without a unit that says whether it is "
-                    f"in radians or revolutions: write {name} (rad/s), (deg/s), (rev/s) or (rpm)"
+                    f"in radians or revolutions: write {name} (rad/s), (deg/s), (turn/s) or (rpm)"
                 )
         if "diameter" not in table.header:
             raise ValueError("spins need the diameter of the spheres: add it to the header")

@@ -132,6 +132,14 @@ def header_number(header: Mapping[str, Any], key: str) -> float:
     return number
 
 
+def positive_number(header: Mapping[str, Any], key: str) -> float:
+    """Return the value of a key that must be a positive number: see `header_number`."""
+    number = header_number(header, key)
+    if number <= 0:
+        raise ValueError(f"header line {key}: must be a positive number, got {header[key]!r}")
+    return number
+
+
 def header_count(header: dict[str, str], key: str) -> int | None:
     """Return the value of a key in the header of a curve, such as N, as a positive whole number.
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from math import pi
 from typing import Any
 
@@ -46,6 +46,9 @@ PROVENANCE_KEYS = ("units", "points", "end_tau", "melt_tau", "steps_per_contact"
 
 PRIOR_KEYS = {f"{symbol}_err": p.name for symbol, p in BY_SYMBOL.items() if symbol != "A"}
 """Header keys of standard errors, and the names of their priors in `jaxgran.fit`."""
+
+MAX_DIFFERENCE = 0.01
+"""Relative difference of a value in a header to the one that is used, above which is asked."""
 
 GUESS = "guess"
 GUESSES = {
@@ -132,17 +135,37 @@ def gas_of_header(header: dict[str, str]) -> tuple[Gas, list[str]]:
         for key in header
         if key in quantities and header[key] != GUESS
     }
-    questions = list(ask_about_header(numbers))
+    return gas, [*ask_about_header(numbers), *_ask_about_unknown_keys(header)]
+
+
+def _ask_about_unknown_keys(header: dict[str, str]) -> Iterator[str]:
     known = dict.fromkeys((*REQUIRED, *BY_SYMBOL, *OPTIONAL_KEYS, *UNIT_KEYS))
     others = {*known, *PRIOR_KEYS, *PROVENANCE_KEYS, *UNSUPPORTED_KEYS}
     # Comments that are no single word are not keys.
     unknown = [key for key in header if key.isidentifier() and key not in others]
     if unknown:
-        questions.append(
+        yield (
             f"ignoring unknown header keys: {', '.join(unknown)}. Known keys are "
             f"{', '.join(known)}, and errors such as eta_err"
         )
-    return gas, questions
+
+
+def ask_about_another_gas(header: dict[str, str], gas: Gas) -> list[str]:
+    """Return questions about a header that describes another sphere than the gas that is used."""
+    sphere = gas.parameters | {"density": 6 / pi * gas.mass / gas.diameter**3}
+    questions = list(_ask_about_unknown_keys(header))
+    for key in ("diameter", "density", "Y", "nu", "eps"):
+        name = BY_SYMBOL[key].name
+        if key not in header or name not in sphere:
+            continue
+        given = files.header_number(header, key)
+        used = float(sphere[name])
+        if abs(given - used) > MAX_DIFFERENCE * abs(used):
+            questions.append(
+                f"{key} is {given:g} in this header, but {used:.4g} in the gas that is used: "
+                "impacts of other spheres need a header of all of them, read without this gas"
+            )
+    return questions
 
 
 def checked_header(header: Any) -> dict[str, str]:

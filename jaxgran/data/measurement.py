@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxgran._utils.formatting import text_table
 from jaxgran._utils.validation import (
+    FRACTION,
     NON_NEGATIVE,
     POSITIVE,
     Domain,
@@ -149,7 +150,7 @@ class Measurement(eqx.Module):
         self.of_energy = of_energy
         self.ensemble_start = ensemble_start
         self.calibration_error = checked_float(
-            "calibration_error", calibration_error, NON_NEGATIVE, "0.02 stands for 2 %."
+            "calibration_error", calibration_error, FRACTION, "0.02 stands for 2 %."
         )
         self.errors_measured = errors_measured
         self.rounding = checked_rounding({} if rounding is None else rounding, data)

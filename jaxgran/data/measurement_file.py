@@ -10,6 +10,7 @@ from jaxgran.data.drop_test import DropTest
 from jaxgran.data.header import (
     ANY_GAS,
     absent_of_header,
+    ask_about_another_gas,
     checked_header,
     gas_of_header,
     guesses_of_header,
@@ -87,23 +88,32 @@ def read_measurement(
                 )
         if gas is None:
             gas, more = gas_of_header(entries)
-            questions += more
-        measurement = Measurement(
-            gas,
-            content.data,
-            num_particles=files.header_count(entries, "N"),
-            replicas=files.header_count(entries, "replicas") or 1,
-            priors=priors_of_header(entries),
-            absent=absent_of_header(entries),
-            tracked=files.header_count(entries, "tracked"),
-            ensemble_start=header_choice(entries, "T0_of", ("run", "ensemble")) == "ensemble",
-            calibration_error=files.header_number({"T_scale_err": "0"} | entries, "T_scale_err"),
-            errors_measured=header_choice(entries, "errors", ("any", "measured")) == "measured",
-            of_energy=header_choice(entries, "T_of", ("velocity", "energy")) == "energy",
-            rounding=content.rounding,
-            guesses=guesses_of_header(entries),
-            header=tuple(entries.items()),
-        )
+        else:
+            more = ask_about_another_gas(entries, gas)
+        questions += more
+        arguments = arguments_of_header(entries)
+        measurement = Measurement(gas, content.data, rounding=content.rounding, **arguments)
     for question in questions:
         warnings.warn(f"{path}: {question}", stacklevel=2)
     return measurement
+
+
+def arguments_of_header(header: dict[str, str]) -> dict[str, Any]:
+    """Return the arguments of `Measurement` that a header gives, but for the gas.
+
+    Raises:
+        ValueError: for a value that is not allowed.
+    """
+    return {
+        "num_particles": files.header_count(header, "N"),
+        "replicas": files.header_count(header, "replicas") or 1,
+        "priors": priors_of_header(header),
+        "absent": absent_of_header(header),
+        "tracked": files.header_count(header, "tracked"),
+        "ensemble_start": header_choice(header, "T0_of", ("run", "ensemble")) == "ensemble",
+        "calibration_error": files.header_number({"T_scale_err": "0"} | header, "T_scale_err"),
+        "errors_measured": header_choice(header, "errors", ("any", "measured")) == "measured",
+        "of_energy": header_choice(header, "T_of", ("velocity", "energy")) == "energy",
+        "guesses": guesses_of_header(header),
+        "header": tuple(header.items()),
+    }

@@ -75,7 +75,7 @@ class Motion:
         position = position[order]
         side = np.inf
         if "box_side" in header:
-            side = files.header_number(header, "box_side")
+            side = files.positive_number(header, "box_side")
             position = _unwrapped(particle, position, side)
         return cls(particle, frame[order], position, times, side)
 

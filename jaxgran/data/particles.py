@@ -43,6 +43,9 @@ UNITS = {
 }
 """Units of length (m), time (s) and mass (kg), by their names in LAMMPS."""
 
+GSD_DEFAULT = 1.0
+"""Diameter, m, and mass, kg, of GSD files that give none."""
+
 DATA_COLUMNS = {
     "atomic": ("id", "type", "x", "y", "z"),
     "sphere": ("id", "type", "diameter", "density", "x", "y", "z"),
@@ -285,7 +288,9 @@ def _read_gsd(path: Path, k: int, dimension: int | None) -> Frame:
     if np.any(tilts != 0):
         raise ValueError(SLANTED)
     spin, time = (snapshot.log.get(name) for name in ("particles/angular_velocity", "time"))
-    columns = {"type": particles.typeid, "diameter": particles.diameter, "mass": particles.mass}
+    columns = {"type": particles.typeid, "diameter": particles.diameter}
+    if np.any(particles.mass != GSD_DEFAULT):  # otherwise it was not given
+        columns["mass"] = particles.mass
     columns |= zip("xyz", np.asarray(particles.position, float).T, strict=True)
     if known:
         columns |= zip(VELOCITY, np.asarray(particles.velocity, float).T, strict=True)

@@ -52,7 +52,10 @@ def read_scene_file(path: Path) -> tuple[dict[str, str], dict[str, Any]]:
         )
     if not isinstance(experiment, dict):
         raise ValueError(f"{EXPERIMENT} must be a table [{EXPERIMENT}], got {experiment!r:.60}")
-    values |= {key: experiment.pop(key) for key in COUNT_KEYS if key in experiment}
+    of_experiment = {key: experiment.pop(key) for key in COUNT_KEYS if key in experiment}
+    if both := [key for key in of_experiment if key in values]:
+        raise ValueError(f"{both[0]} stands before [{EXPERIMENT}] and in it: keep one")
+    values |= of_experiment
     texts = {key: _text(key, value) for key, value in values.items()}
     return header_in_si(texts), experiment
 

@@ -51,8 +51,14 @@ COLUMN_UNITS = {
 
 UNITS = HEADER_UNITS | COLUMN_UNITS
 
-HEADER_ALIASES = {"phi": "eta", "packing_fraction": "eta"}
+HEADER_ALIASES = {
+    **dict.fromkeys(("phi", "packing_fraction"), "eta"),
+    **dict.fromkeys(("phi_err", "packing_fraction_err"), "eta_err"),
+}
 """Further names of header keys."""
+
+ANGLES = ("deg", "degree", "degrees", "°", "rad", "mrad")
+"""Units of angles, which are no parts of a value, as %."""
 
 COMMENT_SIGNS = "#%"
 """Signs at the beginning of header lines and comments."""
@@ -87,7 +93,7 @@ _NAMES_BETWEEN_BLANKS = re.compile(r"[^\s(\[]+(?:\s*[(\[][^)\]]*[)\]])?")
 _DIGITS = r"[+-]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eEdD][+-]?\d+)?"
 _NUMBER = re.compile(_DIGITS)
 _NUMBER_AND_UNIT = re.compile(rf"({_DIGITS})\s*(.*)")
-_SIDES = re.compile(rf"{_DIGITS}(?:\s*[x×]\s*{_DIGITS})+")
+_SIDES = re.compile(rf"{_DIGITS}(?:\s*[x×]\s*{_DIGITS})*")
 _PLUS_MINUS = re.compile(r"\s*(?:±|\+/?-)\s*")
 _BRACKETED = re.compile(r"\(([^()]*)\)(.*)")
 _DIGITS_IN_BRACKETS = re.compile(r"([+-]?\d*[.,]?\d*)\s*\((\d+)\)((?:[eEdD][+-]?\d+)?)(.*)")
@@ -213,6 +219,8 @@ def read_table(
         chosen = list(columns_to_read([name for name in bare_names if name]))
     except ValueError as error:
         raise ValueError(f"line {first}: {error}") from None
+    if not rows:
+        raise ValueError(f"line {first}: no rows follow the names of the columns")
     factors = [_factor(name, units_given, units, "column") for name in bare_names]
     at = [bare_names.index(name) for name in chosen]
     without = _pop_rows_without_identity(
@@ -238,7 +246,13 @@ def read_table(
     columns = dict(zip(chosen, numbers, strict=True))
     for name in chosen:
         if _is_relative(name, units_given):
-            columns[name] = columns[name] * np.abs(columns[name.removesuffix("_err")])
+            value = name.removesuffix("_err")
+            if value not in columns:
+                raise ValueError(
+                    f"line {first}: {name} is a part of {value}, which is not among the columns: "
+                    "name it after its column, or give it in a unit"
+                )
+            columns[name] = columns[name] * np.abs(columns[value])
     return Table(
         _convert_header(header, units, comma),
         columns,
@@ -454,8 +468,16 @@ def _convert_header(header: dict[str, str], units: dict[str, str], comma: bool) 
             numbers = [repr(factor * float(number)) for number in numbers]
         converted[key] = " x ".join(numbers)
     for key in parts:
-        value = converted.get(key.removesuffix("_err"), "1")
-        if _is_relative(key, units_given) and _NUMBER.fullmatch(value):
+        if _base_unit(key, HEADER_UNITS) is None or not _is_relative(key, units_given):
+            continue
+        value_key = key.removesuffix("_err")
+        if value_key not in converted and value_key != "T_scale":  # which is 1
+            raise ValueError(
+                f"header line {key} is a part of {value_key}, which the header lacks: add "
+                f"{value_key}, or give the error in a unit"
+            )
+        value = converted.get(value_key, "1")
+        if _NUMBER.fullmatch(value):
             converted[key] = repr(float(converted[key]) * abs(float(value)))
     return converted
 
@@ -516,7 +538,9 @@ def _is_relative(name: str, units_given: dict[str, str]) -> bool:
     """
     unit = units_given.get(name, "")
     value = units_given.get(name.removesuffix("_err"), "")
-    return name.endswith("_err") and unit != value and _is_dimensionless(unit)
+    if not name.endswith("_err") or unit == value or unit in ANGLES:
+        return False
+    return _is_dimensionless(unit)
 
 
 def _name_and_unit(name: str) -> tuple[str, str]:

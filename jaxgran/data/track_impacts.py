@@ -5,6 +5,7 @@ encounter tell whether, when and how fast two spheres meet. The modules `encount
 `contacts` are the three steps, each for all encounters at once.
 """
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -145,8 +146,11 @@ def read_impacts(path: str | Path, header: dict[str, Any] | None = None) -> Impa
             )
         table = read_table(path, "id,t,x,y,z", tracks.track_columns, given, tracks.IDENTITIES)
         entries = header_in_si(table.header)
-        gas, _ = gas_of_header(entries)
-        return impacts_of_tracks(table.columns, entries, table.lines, gas)
+        gas, questions = gas_of_header(entries)
+        impacts = impacts_of_tracks(table.columns, entries, table.lines, gas)
+    for question in questions:
+        warnings.warn(f"{path}: {question}", stacklevel=2)
+    return impacts
 
 
 def impacts_of_tracks(
@@ -278,12 +282,13 @@ def _drop_test(contacts: Contacts, chosen: Bool[np.ndarray, "n"], onto: str) -> 
     before, after, variance, variance_after, covariance = (x[chosen] for x in contacts.speeds)
     speed_error = np.sqrt(variance)
     error_after = np.sqrt(variance_after)
+    product = error_after * speed_error
     return DropTest(
         speed=before,
         restitution=after / before,
         error=error_after / before,
         onto=onto,
         speed_error=speed_error,
-        correlation=covariance / (error_after * speed_error),
+        correlation=np.clip(covariance / np.where(product > 0, product, 1.0), -1.0, 1.0),
         scatters=True,
     )

@@ -11,8 +11,8 @@ import scipy  # which imports scipy.stats at its first use
 from jaxtyping import Float, Int
 
 from jaxgran.data.curve import MIN_POINTS, CoolingCurve, check_values, from_arrays
-from jaxgran.data.files import header_count, header_number
-from jaxgran.data.particles import Frame, open_frames
+from jaxgran.data.files import header_count, header_number, positive_number
+from jaxgran.data.particles import GSD_DEFAULT, Frame, open_frames
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass
 
@@ -75,9 +75,6 @@ MAX_SONINE = 0.05
 HEADER_TOLERANCE = 0.01
 """Largest relative difference of a number in a header from the trajectory."""
 
-GSD_DEFAULT = 1.0
-"""Diameter, in m, of GSD files that give none."""
-
 
 class Step(NamedTuple):
     """Displacements between two neighbouring frames.
@@ -119,7 +116,7 @@ def track_columns(names: list[str]) -> list[str]:
     """Return the columns of tracks that are read; further ones are ignored.
 
     Raises:
-        ValueError: for a missing column.
+        ValueError: for a missing column, or two columns of one name.
     """
     chosen = [next((name for name in kind if name in names), None) for kind in (IDENTITIES, CLOCKS)]
     coordinates = [name for name in COORDINATES if name in names]
@@ -129,7 +126,10 @@ def track_columns(names: list[str]) -> list[str]:
             "measured, z (or particle and frame, as trackpy names them; or TRACK_ID, "
             "POSITION_X, ..., as TrackMate does)"
         )
-    return [*map(str, chosen), *coordinates]
+    columns = [*map(str, chosen), *coordinates]
+    if twice := [name for name in columns if names.count(name) > 1]:
+        raise ValueError(f"{names.count(twice[0])} columns are {twice[0]}: keep one")
+    return columns
 
 
 def curve_of_tracks(
@@ -273,7 +273,7 @@ def positions_of_tracks(
     if "t" in columns:
         t = columns["t"]
     elif "frame_rate" in header:
-        t = columns["frame"] / header_number(header, "frame_rate")
+        t = columns["frame"] / positive_number(header, "frame_rate")
     else:
         raise ValueError(
             "the tracks have frames without times; add '# frame_rate: ...', in frames per second, "
@@ -294,7 +294,7 @@ def _steps(
     columns: Mapping[str, np.ndarray], header: dict[str, str], lines: list[int]
 ) -> list[Step]:
     ids, t, position = positions_of_tracks(columns, header, lines)
-    side = header_number(header, "box_side") if "box_side" in header else np.inf
+    side = positive_number(header, "box_side") if "box_side" in header else np.inf
     frames = np.split(np.arange(t.size), np.flatnonzero(np.diff(t)) + 1)
     pairs = zip(frames, frames[1:], strict=False)
     return [_step(before, after, ids, t, position, side) for before, after in pairs]
@@ -592,9 +592,9 @@ def _time(k: int, frame: Frame, header: dict[str, str]) -> float:
     if frame.time is not None:
         return frame.time
     if frame.step is not None and "timestep" in header:
-        return frame.step * header_number(header, "timestep")
+        return frame.step * positive_number(header, "timestep")
     if "frame_rate" in header:
-        return k / header_number(header, "frame_rate")
+        return k / positive_number(header, "frame_rate")
     raise ValueError(
         "it has no time: write times into the file (LAMMPS: dump_modify ... time yes; XYZ: "
         "Time=...), or give header={'timestep': ...}, in s, or {'frame_rate': ...}, in 1/s"
@@ -603,7 +603,9 @@ def _time(k: int, frame: Frame, header: dict[str, str]) -> float:
 
 def _quantities(frame: Frame, header: dict[str, str]) -> dict[str, float]:
     """Return T and T_rot of a frame, and their errors, by the names of the fields of a curve."""
-    velocity = frame.velocity - frame.velocity.mean(axis=0) * frame.periodic
+    velocity = frame.velocity
+    if frame.periodic and "container_side" not in header:
+        velocity = velocity - velocity.mean(axis=0)
     energies = {"temperature": np.mean(velocity**2, axis=1)}
     if frame.spin is not None and "diameter" in header:
         inertia = header_number({"reduced_inertia": "0.4"} | header, "reduced_inertia")

@@ -187,4 +187,5 @@ def twin(measurement: Measurement, truth: Truth = AS_GIVEN) -> Measurement:
             relative = np.asarray(error) / np.where(given > 0, given, 1.0)
             fields[f"{name}_error"] = relative * fields[name]
     known = as_jax_arrays({"times": np.asarray(data.times)} | fields)
-    return replace(measurement, data=dataclasses.replace(data, **known))
+    data = dataclasses.replace(data, **known)
+    return replace(measurement, data=data, of_energy=False)

@@ -14,8 +14,14 @@ from jaxgran._utils.tracing import any_traced, is_known, known_part, nan_where
 from jaxgran.data.curve import CoolingCurve, Run
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.scales import scales_at
-from jaxgran.scene.elements import VOLUME_TOLERANCE, container_volume_ratio
-from jaxgran.scene.gas import Gas
+from jaxgran.scene.elements import (
+    NUM_SPIN_COMPONENTS,
+    VOLUME_TOLERANCE,
+    Rough,
+    check_elements,
+    container_volume_ratio,
+)
+from jaxgran.scene.gas import Gas, is_allowed_spread
 from jaxgran.scene.geometry import MIN_BOX, PACKING_LIMIT
 from jaxgran.theory.steady_states import max_thermal_speed
 
@@ -51,6 +57,8 @@ def checked_gas(gas: Any) -> Gas:
     gas.check_single()
     for name, value in gas.parameters.items():  # changed by equinox.tree_at, they were not checked
         gas.domains[name].check(name, value)
+    gas.check_sizes()
+    check_elements(gas)
     return gas
 
 
@@ -106,6 +114,10 @@ def check_softness(gas: Gas) -> None:
     """Raise ValueError if soft contacts would stop the cooling, at T_0 or at the highest T."""
     with jax.ensure_compile_time_eval():
         hottest = 1.0 if gas.drive is None else float(_max_thermal_speed(gas))
+    if isinstance(gas.surface, Rough):  # spins heat at most by all of their energy
+        share = NUM_SPIN_COMPONENTS[gas.dimension] / gas.dimension
+        ratio = float(gas.surface.rotational_temperature / gas.temperature)
+        hottest = max(hottest, (1 + share * ratio) ** 0.5)
     highest = float(gas.temperature) * hottest**2
     check_softness_at(gas, hottest, float(scales_at(gas, highest).softness))
 
@@ -284,6 +296,10 @@ def valid_where_traced(
     allowed = jnp.ones((), bool)
     for name, value in traced.items():
         allowed &= jnp.all(gas.domains[name].contains(value))
+    if gas.container is not None:
+        allowed &= jnp.all(gas.container.side / gas.diameter > MIN_BOX)
+    if gas.diameter_sd is not None:
+        allowed &= is_allowed_spread(gas.size_spread)
     one_or_nan = jnp.where(allowed, 1.0, jnp.nan)
     # A product, so that derivatives are nan, too: an optimiser would take 0 for a minimum.
     gas = gas.replace(**{name: x * one_or_nan.astype(x.dtype) for name, x in traced.items()})

@@ -26,6 +26,7 @@ from jaxgran.particles.hard.dynamics import (
 )
 from jaxgran.particles.hard.impacts import LawOfReplicas
 from jaxgran.scene.gas import Gas, SphereScene, reduced_scene, sphere_scene
+from jaxgran.scene.geometry import wrapped
 from jaxgran.theory.averages import collision_rate
 
 WINDOW_SHARE = 0.05
@@ -142,7 +143,7 @@ class HardSpheres(AbstractSpheres):
             return  # the run checks traced values
         side = float(self.scene(gas).side)
         boxes = np.asarray(self.start.position, float) / float(gas.diameter)
-        trees = [scipy.spatial.KDTree(box % side, boxsize=side) for box in boxes]
+        trees = [scipy.spatial.KDTree(wrapped(box, side), boxsize=side) for box in boxes]
         # The nearest neighbour of each sphere after itself; infinite if none overlaps.
         closest = min(
             np.min(tree.query(tree.data, 2, distance_upper_bound=1.0)[0][:, 1]) for tree in trees

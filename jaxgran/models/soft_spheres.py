@@ -29,6 +29,7 @@ from jaxgran.scene.gas import (
     SphereScene,
     sphere_scene,
 )
+from jaxgran.scene.geometry import wrapped
 from jaxgran.scene.laws import Viscoelastic
 
 PROJECTION = 0.1
@@ -177,7 +178,7 @@ class SoftSpheres(AbstractSpheres):
         stored = 0.0
         diameter = float(gas.diameter)
         for x in np.asarray(start.position, float):
-            tree = scipy.spatial.KDTree(x % side, boxsize=None if gas.container else side)
+            tree = scipy.spatial.KDTree(wrapped(x, side), boxsize=None if gas.container else side)
             distance = tree.sparse_distance_matrix(tree, diameter, output_type="coo_matrix").data
             stored += np.sum((diameter - distance[distance > 0]) ** 2.5) / 2
         stored *= 0.4 * float(elastic_constant(law.youngs_modulus, law.poisson_ratio, diameter))

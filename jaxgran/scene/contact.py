@@ -200,7 +200,8 @@ def impact(
         beta: ``(3/2) A alpha^(2/5) v^(1/5)``, dimensionless, >= 0, a scalar (use `jax.vmap` for
             more). Derivatives (forward mode only) need beta > 0.
         clipped: whether the contact ends at zero force (True, the default) or at zero overlap.
-        rtol: relative tolerance of the adaptive eighth-order solver.
+        rtol: relative tolerance of the adaptive eighth-order solver, at least ten roundings of the
+            type of floats.
         max_steps: largest number of steps of each half of the impact. The default suffices for
             beta <= 1e4 (clipped) and for beta <= 1e3 (unclipped, where the slow rebound takes
             seconds to compute).
@@ -217,6 +218,7 @@ def impact(
     """
     NON_NEGATIVE.check("beta", beta, "It is 1.5 A alpha^0.4 v^0.2.")
     beta = jnp.asarray(beta, dtype=jnp.result_type(float))
+    rtol = max(rtol, 10 * float(jnp.finfo(beta.dtype).eps))
     zero = jnp.zeros_like(beta)
     one = jnp.ones_like(beta)
 

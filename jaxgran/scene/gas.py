@@ -121,6 +121,11 @@ MAX_SIZE_SPREAD = 0.2
 """Largest standard deviation of diameters over their mean: two sizes 1 : 1.5 have it."""
 
 
+def is_allowed_spread(spread: Any) -> Any:
+    """Return whether the theory of unequal sizes holds at a spread of diameters over their mean."""
+    return spread <= MAX_SIZE_SPREAD * (1 + 1e-6)
+
+
 def _optional_number(name: str) -> Any:
     """Return the converter of a field that is a number or None."""
     converter = number_named(name)
@@ -204,7 +209,7 @@ class Gas(eqx.Module):
         ):
             return
         spread = float(np.max(np.asarray(self.diameter_sd) / np.asarray(self.diameter)))
-        if spread > MAX_SIZE_SPREAD * (1 + 1e-6):
+        if not is_allowed_spread(spread):
             raise ValueError(
                 f"diameter_sd is {spread:.3g} of the diameter, at most {MAX_SIZE_SPREAD:g} is "
                 "allowed: the theory is of second order in it. Sieve the grains, or measure one "

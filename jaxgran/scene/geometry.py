@@ -153,3 +153,11 @@ def impact_average(function: Callable[[Array], Array], like: Float[Array, ""]) -
     """
     nodes, weights = (jnp.asarray(x, like.dtype) for x in (NODES, WEIGHTS))
     return jnp.sum(weights * function(nodes))
+
+
+def wrapped(
+    position: Float[np.ndarray, "... d"], side: float | Float[np.ndarray, "d"]
+) -> Float[np.ndarray, "... d"]:
+    """Return positions in a periodic box, 0 <= x < side: a remainder may round to the side."""
+    inside = position % side
+    return np.where(inside < side, inside, 0.0)

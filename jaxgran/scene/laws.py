@@ -730,7 +730,9 @@ class RestitutionSpline(RestitutionLaw):
         cubic = first + last - 2 * slope[i]
         value = y[i] + h * t * (first + t * (slope[i] - first - (1 - t) * cubic))
         outside = jnp.where(log_speed <= x[0], at_knots[0], at_knots[-1]) * (log_speed - inside)
-        return -jnp.expm1(-jnp.maximum(value + outside, 0.0))
+        log_loss = value + outside
+        # jnp.maximum would halve the slope where eps is 1.
+        return -jnp.expm1(-jnp.where(log_loss < 0, 0.0, log_loss))
 
 
 def _typical_shares(speeds: Any) -> Any:

@@ -63,7 +63,8 @@ def steady_state(gas: Gas) -> SteadyState:
         The state; nan under a transformation where no loss balances the drive.
 
     Raises:
-        ValueError: for a gas without a drive, or a gas in which no loss balances the drive.
+        ValueError: for a gas without a drive, with lasting friction or unequal sizes, or in which
+            no loss balances the drive.
 
     Reference: van Noije & Ernst, Granular Matter 1, 57 (1998), for constant restitution and to
     first order in a_2; this solution also has terms of second order.
@@ -74,6 +75,11 @@ def steady_state(gas: Gas) -> SteadyState:
     """
     if gas.drive is None:
         raise ValueError("a gas without drive has no steady state: add drive=WhiteNoise(strength)")
+    for name in ("friction", "diameter_sd"):
+        if name in gas.elements:
+            raise ValueError(
+                f"the steady state of a gas with {name} is not known: leave {name} out"
+            )
     log_theta, sonine, ratio, imbalance = _solve_steady(gas)
     is_steady = imbalance < MAX_IMBALANCE
     if not isinstance(is_steady, Tracer) and not is_steady:

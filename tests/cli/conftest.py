@@ -15,6 +15,7 @@ def scene(tmp_path, monkeypatch):
     (tmp_path / "folder").mkdir()
     (tmp_path / "bad.toml").write_text("eta : 0.05\n")
     (tmp_path / "tables.toml").write_text(SCENE + "[walls]\nside = 0.1\n")
+    (tmp_path / "guess.toml").write_text(SCENE + 'beta_t = "guess"\n')
     (tmp_path / "no_A.toml").write_text(SCENE.replace("A = 3e-6", ""))
     return tmp_path
 

@@ -3,12 +3,13 @@
 import shlex
 
 import jax
+import numpy as np
 import pytest
 
 import jaxgran
 from jaxgran.cli.main import main
 from tests.beads import glass_beads
-from tests.cli.scenes import PNG
+from tests.cli.scenes import PNG, SCENE
 
 
 def test_cool_writes_the_curve_of_the_package(scene, run):
@@ -30,6 +31,25 @@ def test_the_curve_of_a_run_of_particles_tells_their_number(scene):
     assert header["N"] == "64" and header["replicas"] == "2"
 
 
+def test_a_computed_curve_begins_with_the_gas_and_keeps_no_key_of_a_measurement(scene):
+    head = SCENE.replace(" = ", ": ").replace("\n", "\n# ")
+    keys = "t0: 5\n# t0_err: 1\n# tracked: 100\n# T_scale_err: 0.01"
+    (scene / "late.csv").write_text(f"# {head}{keys}\nt,T\n5.1,0.0095\n6,0.006\n8,0.003\n")
+    assert main(["cool", "late.csv", "--model", "dsmc", "--particles", "64"]) == 0
+    curve, header = jaxgran.read_curve(scene / "cooling.csv")
+    np.testing.assert_allclose(curve.times, [0.1, 1.0, 3.0], rtol=1e-12)
+    assert {"t0", "tracked", "T_scale_err"}.isdisjoint(header)
+
+
+def test_the_number_of_a_container_is_that_of_its_density(scene):
+    box = "container_side = 0.02\nwall_restitution = 0.9\n"
+    (scene / "box.toml").write_text(SCENE + box)
+    assert main(["cool", "box.toml", "--model", "dsmc", "--until", "0.1"]) == 0
+    _, header = jaxgran.read_curve(scene / "cooling.csv")
+    expected = jaxgran.read_measurement(scene / "cooling.csv").gas.number_density * 0.02**3
+    assert int(header["N"]) == pytest.approx(float(expected), abs=0.5)
+
+
 def test_choose_prints_reasons(scene, run):
     status, out, _ = run("choose", "scene.toml", "--until", 10)
     assert status == 0 and "Kinetic theory: the fastest model" in out
@@ -47,6 +67,9 @@ BAD_INPUT = {
     "cool scene.toml --until -1": "--until must lie above",
     "cool scene.toml --until 1 --out nowhere/a.csv": "cannot write",
     "cool scene.toml --until 1 --out folder --overwrite": "cannot write",
+    "cool scene.toml --until 1 --out a.json": "--out must end in .csv or .npz, got a.json",
+    "cool guess.toml --until 1": "beta_t is a guess. Give its value",
+    "fit thin.csv --onto-plate": "--onto-plate belongs to --drop-test",
     "cool scene.toml --until 1 --out a.png": "--out must not end in .png, got a.png",
     "fit nowhere.csv --particles 1.5": "a whole number between -2^63 and 2^63, got 1.5",
     "cool scene.toml --until 1 --key 1e30": "whole number between -2^63",

@@ -53,6 +53,31 @@ def test_each_kind_of_columns_gives_the_same_impacts(drops_of):
     np.testing.assert_allclose(centres.speed_error, 0.01)
 
 
+def test_errors_of_angles_are_angles(drops_of):
+    rows = "0.3,0.01,30,1,0.9,0.01,0.2,0.02\n0.3,0.01,60,1,0.9,0.01,0.2,0.02\n"
+    names = "v,v_err,angle,angle_err{},eps,eps_err,eps_t,eps_t_err\n"
+    plain = drops_of(names.format("") + rows)
+    degrees = drops_of(names.format(" (deg)") + rows)
+    np.testing.assert_allclose(degrees.tangential_speed_error, plain.tangential_speed_error)
+    # Of an angle alone both speeds have one error: their correlation is -1, and no less.
+    only = "v,angle,angle_err,eps,eps_err,eps_t,eps_t_err\n"
+    each = "".join(f"0.3,{x},1,0.9,0.01,0.2,0.02\n" for x in np.linspace(3, 87, 50))
+    np.testing.assert_allclose(drops_of(only + each).tangential_correlation, -1.0)
+
+
+def test_a_part_of_no_column_is_refused(drops_of):
+    with pytest.raises(ValueError, match="v_err is a part of v, which is not among the columns"):
+        drops_of(VELOCITIES + " (%)\n" + ",".join("1" * 10) + "\n")
+
+
+def test_another_sphere_in_the_header_is_asked_about(drops_of):
+    text = "v,eps,eps_err\n0.3,0.9,0.01\n0.4,0.9,0.01\n"
+    with pytest.warns(UserWarning, match="diameter is 0.006 in this header, but 0.002 in the gas"):
+        drops_of(text, diameter="6 mm")
+    with pytest.warns(UserWarning, match="unknown header keys: eps_scatter"):
+        drops_of(text, eps_scatter="yes")
+
+
 def test_errors_of_speeds_and_angles_are_those_of_both_components(drops_of):
     test = drops_of("v_n,v_t,v_t_err,eps,eps_err,eps_t,eps_t_err\n.3,.4,.02,.9,.01,.2,.02\n")
     assert test.speed_error is None

@@ -30,6 +30,28 @@ def test_eta_follows_from_N_and_the_container():
     assert float(gas.packing_fraction) == pytest.approx(2000 * np.pi / 6 * (0.003 / 0.09) ** 3)
 
 
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"container_side": "9 cm"},
+        {"container_side": "90 ± 1 mm"},
+        {"container_side": "9", "length_unit": "cm"},
+        {"container_side": "9 x 9 x 9 cm"},
+    ],
+)
+def test_a_side_has_the_unit_that_was_given(keys):
+    sides = header_in_si(keys)["container_side"]
+    np.testing.assert_allclose([float(side) for side in sides.split("x")], 0.09)
+
+
+def test_an_error_in_per_cent_needs_its_value():
+    assert header_in_si({"phi": "0.04", "phi_err": "5 %"})["eta_err"] == "0.002"
+    assert float(header_in_si({"T_scale_err": "2 %"})["T_scale_err"]) == approx(0.02)
+    assert header_in_si({"camera_err": "2 %"})["camera_err"] == "2 %"
+    with pytest.raises(ValueError, match="density_err is a part of density, which .* lacks"):
+        header_in_si({"density_err": "2 %"})
+
+
 def test_a_header_says_what_is_known_of_the_measurement(write):
     known = {"replicas": 3, "tracked": 120, "errors": "measured", "absent": "walls, drag"}
     measurement = read_measurement(write(text_of(**known, eta_err=0.002)), {"N": 500})

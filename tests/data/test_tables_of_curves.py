@@ -103,3 +103,13 @@ def test_a_missing_library_is_reported(curve, library, monkeypatch):
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(ModuleNotFoundError, match=f"needs {library}: pip install"):
         getattr(curve, f"to_{library}")()
+
+
+def test_a_table_without_times_or_with_two_temperatures_is_refused():
+    pandas = pytest.importorskip("pandas")
+    table = pandas.DataFrame({"T": [3.0, 2.0, 1.0]})
+    with pytest.raises(ValueError, match="the table has no times"):
+        jaxgran.CoolingCurve.from_pandas(table)
+    table = table.assign(t=[0.0, 1.0, 2.0], temperature=[1.0, 1.0, 1.0])
+    with pytest.raises(ValueError, match="are the same quantity: keep one"):
+        jaxgran.CoolingCurve.from_pandas(table)

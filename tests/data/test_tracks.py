@@ -89,12 +89,18 @@ def test_impacts_between_frames_are_corrected(read):
     assert of_eps["T_from"] == header["T_from"]
 
 
+def test_two_columns_of_one_name_are_refused(read):
+    with pytest.raises(ValueError, match="2 columns are x: keep one"):
+        read("id,t,x (px),y (px),x (mm),y (mm)\n1,0,1,1,.1,.1\n")
+
+
 CASES = [
     (lambda rows: rows + [rows[-1]], r"line 66: particle 10 at t = .* given again, after line 65"),
     (lambda rows: [r for r in rows if r.startswith("4,")], r"of 1 particle\(s\) in 6 frames"),
     (lambda rows: rows[:30], r"in 3 frames; at least 3 particles in 4 frames are needed"),
     (lambda rows: [*rows[:-1], "x" + rows[-1]], r"line 65: expected 5 finite numbers"),
     (lambda rows: [*rows[:-1], "1.5" + rows[-1][2:]], r"line 65: id is 1.5; number the particles"),
+    ({"box_side": "-1"}, "box_side: must be a positive number, got '-1'"),
     ({"N": "5"}, "N = 5, but 10 particles are tracked"),
     ({"dimension": "2"}, "dimension 2 has no tracks with 3 coordinates"),
     ({"localisation_error": "-1"}, "localisation_error: must be >= 0"),

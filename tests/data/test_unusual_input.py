@@ -88,6 +88,9 @@ REFUSED = {
     "missing: t; not known: when": "when,T\n1,2\n",
     "missing: T; not known: speed; .* there may be vx2, v2_xy, v2, energy": "t,speed\n1,2\n",
     "missing: T; not known: vx2_err": "t,vx2_err\n1,2\n",
+    "no rows follow the names": "t,T\n",
+    "T_err is a part of T, .*name it after its column": "t,v2,T_err (%)\n0,1,1\n1,.5,1\n2,.3,1\n",
+    "v2_err and T_err each|T_err and v2_err each": "t,v2,T_err,v2_err\n0,1,1,1\n",
     "each once": "t,T,T\n1,2,3\n",
     "T and vx2 .*; keep one": "t,T,vx2\n1,2,3\n",
     "column energy .*add diameter and density": ENERGY,
@@ -232,7 +235,7 @@ def test_drop_tests_are_read_like_curves(tmp_path):
         ("v,eps,eps_err\n0.02,1.2,0.02\n", "at most 1 .*got 1.2 .- 0.02"),
         ("v,eps\n1,2\n", "line 1: .*v, eps; .*v,eps,eps_err"),
         ("v,eps,eps_err\n0.1,0.9\n", "line 2: expected 3 finite numbers .*, got '0.1,0.9'"),
-        ("v,eps,eps_err\n", "at least one impact"),
+        ("v,eps,eps_err\n", "line 1: no rows follow"),
         ("v,eps,eps_err\n0.1,0.9,0\n", "error must lie in"),
     ):
         with pytest.raises(ValueError, match=message):
