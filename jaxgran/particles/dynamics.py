@@ -9,13 +9,26 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import equinox as eqx
+import jax.numpy as jnp
 from equinox import AbstractVar
-from jaxtyping import Array, ArrayLike, Bool
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from jaxgran.gradients.rule import Records
 from jaxgran.particles.capacity import Capacity
 
 P = TypeVar("P", bound="AbstractProcess")
+
+
+def time_left(state: Any, until: ArrayLike) -> Float[Array, "..."]:
+    """Return the time from a state, with the fields `time` and `time_rest`, to another time."""
+    return (jnp.asarray(until) - state.time) - state.time_rest
+
+
+def advance_time(state: Any, duration: ArrayLike) -> Any:
+    """Advance the time of a state by a duration: `time_rest` is its rounding error."""
+    passed = state.time_rest + duration
+    time = state.time + passed
+    return state._replace(time=time, time_rest=passed - (time - state.time))
 
 
 class AbstractProcess(eqx.Module):

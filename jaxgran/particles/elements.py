@@ -134,7 +134,7 @@ MAX_KICK = 0.05
 """Largest relative growth of T by the kicks of one step."""
 
 
-def kick_variance(
+def kick_growth(
     strength: Array, drag: ReducedDrag | None, start: Array, duration: Array, place: float
 ) -> Array:
     """Return the growth of T by half of the kicks of a step, at its start (place 0) or end (1).

@@ -20,7 +20,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 from jaxgran._utils import status
 from jaxgran.particles import neighbours, observables
 from jaxgran.particles.capacity import Capacity, skin_for_pairs
-from jaxgran.particles.dynamics import AbstractDynamics
+from jaxgran.particles.dynamics import AbstractDynamics, advance_time
 from jaxgran.particles.neighbours import ListedPairs, Pairs
 from jaxgran.particles.start import (
     Placement,
@@ -403,20 +403,13 @@ def min_duration(state: SphereState) -> Float[Array, ""]:
     return jnp.where(speed > 0, MIN_FLIGHT / jnp.where(speed > 0, speed, 1.0), 0.0)
 
 
-def time_left(state: SphereState, end: ArrayLike) -> Array:
-    """Return the time from a state to an end."""
-    return (jnp.asarray(end) - state.time) - state.time_rest
-
-
-def advance_time(
+def advance_to_end(
     state: SphereState, duration: ArrayLike, end: ArrayLike, at_end: ArrayLike
 ) -> SphereState:
-    """Advance the time of a state by a duration, or to the end, by a compensated sum."""
-    step = state.time_rest + duration
-    time = state.time + step
-    return state._replace(
-        time=jnp.where(at_end, end, time),
-        time_rest=jnp.where(at_end, 0.0, step - (time - state.time)),
+    """Advance the time of a state by a duration, or exactly to the end."""
+    later = advance_time(state, duration)
+    return later._replace(
+        time=jnp.where(at_end, end, later.time), time_rest=jnp.where(at_end, 0.0, later.time_rest)
     )
 
 

@@ -168,7 +168,7 @@ def collide(
     relative: Float[Array, "pairs d"],
     bits: UInt32[Array, "2 pairs"],
     ceiling: Float[Array, ""],
-    share: Float[Array, ""],
+    chance: Float[Array, ""],
     scene: ReducedScene,
     spin: Float[Array, "pairs spins"],
     drag_factor: Float[Array, ""] | float = 1.0,
@@ -179,12 +179,12 @@ def collide(
         relative: g = v_i - v_j of equal masses.
         bits: random bits.
         ceiling: |g| at which a candidate collides with probability 1 in a whole step.
-        share: fraction of the step to be done.
+        chance: probability of each collision of the whole step.
         scene: in reduced units.
         spin: s_i + s_j; smooth spheres have no components.
         drag_factor: ratio of physical velocities to these.
     """
-    impacts = _draw_impacts(relative, bits, ceiling, share)
+    impacts = _draw_impacts(relative, bits, ceiling, chance)
     square = jnp.sum(impacts.along**2, axis=-1)
     hit = impacts.hit & (square > 0)
     speed = jnp.sqrt(jnp.where(hit, square, ceiling**2))
@@ -232,26 +232,26 @@ def _draw_impacts(
     relative: Float[Array, "pairs d"],
     bits: UInt32[Array, "2 pairs"],
     ceiling: Float[Array, ""],
-    share: Float[Array, ""],
+    chance: Float[Array, ""],
 ) -> _Impacts:
     """Draw impacts at a rate proportional to |g|, with normals weighted by g.n: see `collide`."""
     dtype = relative.dtype
     g = [relative[:, k] for k in range(relative.shape[-1])]
     square = sum(x * x for x in g)
     speed = jnp.sqrt(jnp.where(square > 0, square, 1.0))
-    uniform = [((b >> 11).astype(dtype) + 0.5) * 2.0**-20 - 1 for b in bits]
-    chance = ((bits[0] & 2047) << 11 | (bits[1] & 2047)).astype(dtype) + 0.5
-    hit = (square > 0) & (chance * 2.0**-22 * ceiling < speed * share)
+    uniform = (((bits[0] & 2047) << 11 | (bits[1] & 2047)).astype(dtype) + 0.5) * 2.0**-22
+    hit = (square > 0) & (uniform * ceiling < speed * chance)
+    signed = [((b >> 11).astype(dtype) + 0.5) * 2.0**-20 - 1 for b in bits]  # in (-1, 1)
     if len(g) == 2:
         # The impact parameter is uniform.
-        sine = uniform[0]
+        sine = signed[0]
         cosine = jnp.sqrt(1 - sine**2)
         along = [cosine * (cosine * g[0] - sine * g[1]), cosine * (cosine * g[1] + sine * g[0])]
     else:
         # Elastic impacts would scatter g in a random direction.
-        along = [(x - speed * n) / 2 for x, n in zip(g, _random_direction(*uniform), strict=True)]
+        along = [(x - speed * n) / 2 for x, n in zip(g, _random_direction(*signed), strict=True)]
     beyond = jnp.where(square > 0, jnp.maximum(speed / ceiling - 1, 0.0), 0.0)
-    return _Impacts(hit, jnp.stack(along, axis=-1), share * jnp.sum(beyond))
+    return _Impacts(hit, jnp.stack(along, axis=-1), chance * jnp.sum(beyond))
 
 
 SINE = [(-1) ** k * (pi / 2) ** (2 * k + 1) / factorial(2 * k + 1) for k in range(8)]
@@ -278,6 +278,7 @@ MIN_SUBSET_SIZE = 16
 
 
 def num_subsets(num_particles: int) -> int:
+    """Return the number of subsets into which particles are divided."""
     return max(min(MAX_SUBSETS, num_particles // MIN_SUBSET_SIZE), 1)
 
 
@@ -290,9 +291,9 @@ def change_subsets(
     count: Int[Array, ""],
     largest: Int[Array, ""],
     change: Callable[..., tuple[Array, Sums]],
-    zero: Sums,
+    sums: Sums,
 ) -> tuple[Float[Array, "N components"], Sums]:
-    """Change some subsets of the particles of one replica; return them and sums over the changes.
+    """Change some subsets of the particles of one replica; return all particles, and sums.
 
     A subset consists of neighbouring rows; each particle belongs to exactly one.
 
@@ -302,18 +303,18 @@ def change_subsets(
         count: number of subsets.
         largest: largest `count` of all replicas, which share the loop.
         change: a function of the index of the subset, rows of particles and a mask of those that
-            belong to the subset. It returns the changed rows and the sums.
-        zero: sums without changes.
+            belong to the subset. It returns the changed rows, and what this adds to the sums.
+        sums: before the changes.
     """
     n = len(particles)
-    parts = num_subsets(len(particles))
-    size = -(-n // parts)
+    subsets = num_subsets(n)
+    size = -(-n // subsets)
 
     def change_one(i: Int[Array, ""], carry: tuple[Array, Sums]) -> tuple[Array, Sums]:
         particles, sums = carry
-        index = ((first + i) & (2**30 - 1)) % parts  # >= 0 where the sum overflows, too
-        begin = index * n // parts
-        end = (index + 1) * n // parts
+        index = ((first + i) & (2**30 - 1)) % subsets  # >= 0 where the sum overflows, too
+        begin = index * n // subsets
+        end = (index + 1) * n // subsets
         top = jnp.minimum(begin, n - size)
         row = top + jnp.arange(size, dtype=top.dtype)
         belongs = (row >= begin) & (row < end) & (i < count)
@@ -321,4 +322,4 @@ def change_subsets(
         particles = jax.lax.dynamic_update_slice_in_dim(particles, rows, top, 0)
         return particles, jax.tree.map(jnp.add, sums, more)
 
-    return jax.lax.fori_loop(0, largest, change_one, (particles, zero))
+    return jax.lax.fori_loop(0, largest, change_one, (particles, sums))

@@ -41,13 +41,13 @@ from jaxgran.particles.dsmc.collisions import (
     num_subsets,
     waiting_time,
 )
-from jaxgran.particles.dynamics import AbstractDynamics
+from jaxgran.particles.dynamics import AbstractDynamics, advance_time, time_left
 from jaxgran.particles.elements import (
     MAX_KICK,
     DragDecay,
     drag_decay,
     exchange_slopes,
-    kick_variance,
+    kick_growth,
     random_kicks,
     random_words,
     tangential_impulse,
@@ -77,6 +77,12 @@ CHUNK = 4_000_000
 
 MIN_STEPS = 16
 """Least number of steps in one call of `DSMCDynamics.advance`."""
+
+COLLISION_STREAM = 0
+WALL_STREAM = 1
+KICK_STREAMS = 2, 3
+DURATION_STREAM = 4
+"""Streams of the random numbers of a step. Those of kicks are of its start and of its end."""
 
 
 class DSMCGas(NamedTuple):
@@ -126,9 +132,23 @@ class DSMCState(NamedTuple):
     shown: DSMCGas
 
 
-SubsetCounts = tuple[Int[Array, "*replicas"] | None, Int[Array, "*replicas"] | None]
-"""Numbers of subsets that a drive kicks in half of a step, and of those that may hit walls in the
-step; None without a drive or walls."""
+def split_columns(
+    particles: Float[Array, "*rows components"], d: int
+) -> tuple[Float[Array, "*rows d"], Float[Array, "*rows spins"], Float[Array, "*rows d"]]:
+    """Return the velocities, the spins and x - v t of particles, see `DSMCGas`."""
+    return particles[..., :d], particles[..., d:-d], particles[..., -d:]
+
+
+class SubsetCounts(NamedTuple):
+    """Numbers of subsets that take part in a step.
+
+    Attributes:
+        kicked: those that a drive kicks in half of the step; None without a drive.
+        at_walls: those that may hit walls in the step; None without walls.
+    """
+
+    kicked: Int[Array, "*replicas"] | None = None
+    at_walls: Int[Array, "*replicas"] | None = None
 
 
 class EnergyGains(NamedTuple):
@@ -150,6 +170,78 @@ def directional_slopes(gradient: Any, directions: Any) -> Float[Array, "p"]:
     """Return the derivatives along some directions, from the derivatives in all numbers."""
     products = jax.tree.map(lambda g, x: jnp.tensordot(x, g, g.ndim), gradient, directions)
     return sum(jax.tree.leaves(products), start=jnp.zeros(1))  # a law may have no floats
+
+
+def wall_impact_rate(
+    eps: Float[Array, "*#rows"], frequency: Float[Array, "*#rows"], dimension: int
+) -> Float[Array, "..."]:
+    """Return the rate of impacts of a sphere on walls in a step, over its speed along the axis.
+
+    A sphere between two walls hits one of them at the rate ``|v|/(L - sigma)``, times the ratio of
+    the density before walls to the mean (`wall_impact_ratio`). A gas at T_0 has a mean |v| of
+    ``1/sqrt(pi)``, and hits them with the given frequency: ``1/(L - sigma)`` is
+    ``sqrt(pi) frequency``. Each step has walls across one axis, in turn, with d times this rate.
+
+    Args:
+        eps: restitution of the walls at the speed of an impact.
+        frequency: `ReducedWalls.frequency` of the axis.
+        dimension: d.
+    """
+    ratio = wall_impact_ratio(eps, frequency / collision_rate(0.0, dimension), dimension)
+    return dimension * sqrt(pi) * ratio * frequency
+
+
+def wall_impacts(
+    scene: ReducedScene,
+    decay: DragDecay,
+    velocity_factor: Float[Array, ""],
+    spin_factor: Float[Array, ""],
+    *,
+    rows: Float[Array, "rows components"],
+    axis: Int[Array, ""],
+    uniform: Float[Array, "rows"],
+    dt: Float[Array, ""],
+) -> tuple[Float[Array, "energies"], tuple[Float[Array, "rows d"], Float[Array, "rows spins"]]]:
+    """Return the gains by impacts on walls in a step, and the velocities and spins after it.
+
+    Args:
+        scene, decay, velocity_factor, spin_factor: see `DSMCDynamics._exchanged`.
+        rows: particles.
+        axis: across which the walls are.
+        uniform: random numbers; a particle hits a wall if its number is below the expected number
+            of its impacts.
+        dt: length of the step.
+    """
+    walls = scene.walls
+    surface = scene.surface
+    d = walls.frequency.size
+    velocity, spin, _ = split_columns(rows, d)
+    velocity = velocity * velocity_factor
+    spin = spin * spin_factor
+    across = (jnp.arange(d, dtype=jnp.int32) == axis).astype(rows.dtype)[None]
+    normal = jnp.sum(velocity * across, axis=1)
+    speed = jnp.abs(normal)
+    outwards = jnp.sign(normal)[:, None] * across
+    eps = walls.law.restitution(jnp.where(speed > 0, speed * decay.velocity, 1.0))
+    rate = wall_impact_rate(eps, walls.frequency[axis], d)
+    num_impacts = rate * speed * dt
+    hits = (uniform < num_impacts) & (speed > 0)
+    push = jnp.where(hits, (1 + eps) * speed, 0.0)
+    kick = -push[:, None] * outwards
+    spin_change = jnp.zeros_like(spin)
+    if surface is not None and walls.surface is not None:
+        eta = surface.eta_on_wall(walls.surface)
+        _, sliding_kick, spin_change = tangential_impulse(
+            velocity, spin, outwards, hits, eta, surface, push
+        )
+        kick = kick + sliding_kick
+    # The number of impacts is not differentiable, so weights of value 1 carry its derivative.
+    weight = (rate / jax.lax.stop_gradient(rate))[:, None]
+    gains = [jnp.sum(weight * kick * (2 * velocity + kick))]
+    if surface is not None:
+        gain = jnp.sum(weight * spin_change * (2 * spin + spin_change))
+        gains.append(surface.inertia * gain / decay.spin**2)
+    return jnp.stack(gains), (velocity + kick, (spin + spin_change) / decay.spin)
 
 
 class DSMCDynamics(AbstractDynamics):
@@ -201,13 +293,13 @@ class DSMCDynamics(AbstractDynamics):
         key = jax.random.fold_in(threefry_key(words), 2**32 - 1)
         velocity = maxwellian_velocities(key, self.shape)
         v = velocity.reshape(replicas, -1, d)
-        parts = [v / sqrt(2)]
+        columns = [v / sqrt(2)]
         if scene.surface is not None:
             key = jax.random.fold_in(key, 0)
             mean_square = (scene.surface.ratio / (2 * scene.surface.inertia)).astype(v.dtype)
             spins = maxwellian_spins(key, (replicas, n, NUM_SPIN_COMPONENTS[d]), mean_square)
-            parts.append(spins)
-        parts.append(jnp.zeros_like(v))
+            columns.append(spins)
+        columns.append(jnp.zeros_like(v))
         tangents = None
         if directions is not None:
             tangents = ExchangeTangents.initial(directions, scene, velocity, replicas)
@@ -217,7 +309,7 @@ class DSMCDynamics(AbstractDynamics):
             time_rest=zero,
             duration=waiting_time(jax.random.fold_in(key, 1), self.scheme.candidates, zero),
             temperature=zero + 1,
-            particles=jnp.concatenate(parts, axis=-1),
+            particles=jnp.concatenate(columns, axis=-1),
             collisions=zero,
             missed=zero,
             steps=jnp.zeros(replicas, jnp.uint32),
@@ -227,7 +319,7 @@ class DSMCDynamics(AbstractDynamics):
             time=jnp.zeros((), v.dtype),
             status=jnp.zeros(replicas, jnp.int32),
             key=words,
-            first_velocity=parts[0],
+            first_velocity=columns[0],
             gas=gas,
             shown=gas,
         )
@@ -271,24 +363,13 @@ class DSMCDynamics(AbstractDynamics):
 
     def to_lab_frame(self, state: DSMCState) -> tuple[Array, Array, Array | None]:
         d = self.scheme.dimension
-        particles = state.shown.particles
+        velocity, spins, _ = split_columns(state.shown.particles, d)
         decay = drag_decay(self.scene.drag, state.time)
-        velocity = particles[..., :d] * decay.velocity
+        velocity = (velocity * decay.velocity).reshape(-1, d)
         spin = None
         if self.scene.surface is not None:
-            spins = particles[..., d:-d] * decay.true_spin
-            spin = spins.reshape(-1, spins.shape[-1])
-        velocity = velocity.reshape(-1, d)
+            spin = (spins * decay.true_spin).reshape(-1, spins.shape[-1])
         return jnp.full_like(velocity, jnp.nan), velocity, spin
-
-    def kick_growth(
-        self, start: Float[Array, "*replicas"], ds: Float[Array, "*replicas"], place: float
-    ) -> Float[Array, "*replicas"]:
-        """Return the growth of T/T_0 by half of the kicks of a step.
-
-        They come at its start (place 0) or end (1).
-        """
-        return kick_variance(self.scene.drive, self.scene.drag, start, ds, place)
 
     def max_wall_impacts(
         self, gas: DSMCGas, ds: Float[Array, "*replicas"]
@@ -300,8 +381,7 @@ class DSMCDynamics(AbstractDynamics):
         true_speed = speed * drag_decay(self.scene.drag, gas.time).velocity
         eps = walls.law.restitution(true_speed)[..., None]
         frequency = jnp.broadcast_to(walls.frequency, (*eps.shape[:-1], d))
-        ratio = wall_impact_ratio(eps, frequency / collision_rate(0.0, d), d)
-        return jnp.max(ratio * frequency, axis=-1) * (d * sqrt(pi)) * speed * ds
+        return jnp.max(wall_impact_rate(eps, frequency, d), axis=-1) * speed * ds
 
     def full_step(self, gas: DSMCGas) -> Float[Array, "*replicas"]:
         """Return the time in which all candidates of the next step happen."""
@@ -322,7 +402,7 @@ class DSMCDynamics(AbstractDynamics):
         """Return whether the next step of each replica ends before a time."""
         return self.step_length(gas) <= time_left(gas, until)
 
-    def subsets_per_step(self, gas: DSMCGas, share: Float[Array, "*replicas"]) -> SubsetCounts:
+    def subset_counts(self, gas: DSMCGas, step_share: Float[Array, "*replicas"]) -> SubsetCounts:
         """Return the numbers of subsets that take part in a share of a step.
 
         A drive kicks so many subsets in half of it that T of none grows by more than the share
@@ -330,20 +410,22 @@ class DSMCDynamics(AbstractDynamics):
         w T, by which a_2 of all particles is too large by ``w^2/12``, at most 2e-4. So many subsets
         may hit walls that one of the fastest spheres hits at most one.
         """
-        parts = num_subsets(self.scheme.num_particles)
-        ds = share * self.full_step(gas)
+        scene = self.scene
+        subsets = num_subsets(self.scheme.num_particles)
+        ds = step_share * self.full_step(gas)
 
         def at_least(needed: Array) -> Array:
-            return jnp.clip(jnp.ceil(needed), 1, parts).astype(jnp.int32)
+            return jnp.clip(jnp.ceil(needed), 1, subsets).astype(jnp.int32)
 
-        kicks = walls = None
-        if self.scene.drive is not None:
-            growth = self.kick_growth(gas.time, ds, 0.0)
+        counts = SubsetCounts()
+        if scene.drive is not None:
+            growth = kick_growth(scene.drive, scene.drag, gas.time, ds, 0.0)
             safe = jnp.where(gas.temperature > 0, gas.temperature, 1.0)
-            kicks = at_least(parts * growth / (MAX_KICK * safe))
-        if self.scene.walls is not None:
-            walls = at_least(parts * self.max_wall_impacts(gas, ds))
-        return kicks, walls
+            counts = counts._replace(kicked=at_least(subsets * growth / (MAX_KICK * safe)))
+        if scene.walls is not None:
+            impacts = self.max_wall_impacts(gas, ds)
+            counts = counts._replace(at_walls=at_least(subsets * impacts))
+        return counts
 
     def _steps(
         self,
@@ -363,14 +445,14 @@ class DSMCDynamics(AbstractDynamics):
         def step_due(carry: tuple) -> tuple:
             gas, steps_left = carry
             full = self.full_step(gas)
-            share = self.is_due(gas, until).astype(gas.time.dtype)
+            due = self.is_due(gas, until).astype(gas.time.dtype)
             if scene.drive is not None or scene.walls is not None:
-                share = share * self.step_length(gas) / full
-            part = jnp.clip(time_left(gas, until) / full, 0.0, 1.0)
+                due = due * self.step_length(gas) / full
+            last = jnp.clip(time_left(gas, until) / full, 0.0, 1.0)
+            step_share = jnp.where(in_part, last, due)
             # A step ends with its last candidate, which does not happen within the step.
-            part_chance = part * (1 - 1 / self.scheme.candidates)
-            chance = jnp.where(in_part, part_chance, share)
-            return self.step(gas, key, jnp.where(in_part, part, share), chance), steps_left - 1
+            chance = jnp.where(in_part, last * (1 - 1 / self.scheme.candidates), due)
+            return self.step(gas, key, step_share, chance), steps_left - 1
 
         return jax.lax.while_loop(unfinished, step_due, (gas, num_steps))[0]
 
@@ -378,24 +460,25 @@ class DSMCDynamics(AbstractDynamics):
         self,
         gas: DSMCGas,
         key: UInt32[Array, "2"],
-        share: Float[Array, "replicas"],
+        step_share: Float[Array, "replicas"],
         chance: Float[Array, "replicas"],
     ) -> DSMCGas:
         """Do a share, 0 to 1, of the next step of each replica, with a chance of each candidate."""
         replicas = jnp.arange(self.shape[0], dtype=jnp.uint32)
         keys = jax.vmap(jax.random.fold_in, (None, 0))(threefry_key(key), replicas)
-        subsets = self.subsets_per_step(gas, share)
-        largest = jax.tree.map(jnp.max, subsets)
+        counts = self.subset_counts(gas, step_share)
+        largest = jax.tree.map(jnp.max, counts)
         step_replica = partial(self._step, largest=largest)
         axes = jax.tree.map(lambda _: 0, gas._replace(tangents=None))
         if gas.tangents is not None:
             last = jax.tree.map(lambda _: -1, gas.tangents._replace(directions=None))
             axes = axes._replace(tangents=last)
-        gas = jax.vmap(step_replica, (axes, 0, 0, 0, 0), axes)(gas, keys, subsets, share, chance)
+        step_all = jax.vmap(step_replica, (axes, 0, 0, 0, 0), axes)
+        gas = step_all(gas, keys, counts, step_share, chance)
         due = gas.steps % RECOUNT_INTERVAL == 0
 
         def recount(temperature: Array) -> Array:
-            velocity = gas.particles[..., : self.scheme.dimension]
+            velocity, _, _ = split_columns(gas.particles, self.scheme.dimension)
             from_velocities = 2 * jnp.mean(velocity**2, axis=(1, 2))
             return jnp.where(due, from_velocities, temperature)
 
@@ -406,92 +489,91 @@ class DSMCDynamics(AbstractDynamics):
         self,
         gas: DSMCGas,
         key: PRNGKeyArray,
-        subsets: SubsetCounts,
-        share: Float[Array, ""],
+        counts: SubsetCounts,
+        step_share: Float[Array, ""],
         chance: Float[Array, ""],
         largest: SubsetCounts,
     ) -> DSMCGas:
         """Do a share, 0 to 1, of a step of one replica; random numbers do not depend on the share.
 
         Each collision of the whole step takes place with the probability `chance`, so that the
-        state within a step is as accurate as at its end. `largest` are the largest numbers of
-        subsets of all replicas.
+        state within a step is as accurate as at its end. `largest` are the largest `counts` of all
+        replicas.
         """
         scheme = self.scheme
-        before = gas
-        key = jax.random.fold_in(key, gas.steps)
-        dt = share * self.full_step(gas)
-        kicks, walls = zip(subsets, largest, strict=True)
-        kick = partial(self._kick, key=key, dt=dt, counts=kicks, time=gas.time)
-        gas = kick(gas, place=0)
-        particles, outcome, gains = self._collide(gas, key, dt, chance)
-        if self.scene.walls is not None:
-            particles, more = self._hit_walls(gas, key, dt, particles, walls)
-            gains = jax.tree.map(jnp.add, gains, more)
+        start = gas
+        key = jax.random.fold_in(key, start.steps)
+        dt = step_share * self.full_step(start)
+        kick = partial(self._kick, start=start, key=key, dt=dt, counts=counts, largest=largest)
+        gas = kick(start, place=0)
+        particles, gains, num, missed = self._collide(gas, key, dt, chance)
+        gas = gas._replace(particles=particles)
+        particles, gains = self._hit_walls(gas, key, dt, counts, largest, gains)
         energy = scheme.num_particles * scheme.dimension / 2  # sum v^2 at T_0
-        passed = gas.time_rest + dt
-        after = gas.time + passed
-        next_duration = waiting_time(jax.random.fold_in(key, 4), scheme.candidates, gas.duration)
-        gas = gas._replace(
-            time=after,
-            time_rest=passed - (after - gas.time),
-            duration=jnp.where(share > 0, next_duration, gas.duration),
+        duration_key = jax.random.fold_in(key, DURATION_STREAM)
+        next_duration = waiting_time(duration_key, scheme.candidates, gas.duration)
+        gas = advance_time(gas, dt)._replace(
+            duration=jnp.where(step_share > 0, next_duration, gas.duration),
             temperature=gas.temperature + gains.values[0] / energy,
             particles=particles,
-            collisions=gas.collisions + outcome.num,
-            missed=gas.missed + outcome.missed,
-            steps=gas.steps + (share > 0).astype(gas.steps.dtype),
+            collisions=gas.collisions + num,
+            missed=gas.missed + missed,
+            steps=gas.steps + (step_share > 0).astype(gas.steps.dtype),
         )
         gas = kick(gas, place=1)
-        if before.tangents is None:
+        if start.tangents is None:
             return gas
-        return gas._replace(tangents=self._tangents_after(before, gains, dt, outcome.num))
+        return gas._replace(tangents=self._tangents_after(start, gains, dt, num))
 
     def _kick(
         self,
         gas: DSMCGas,
+        start: DSMCGas,
         key: PRNGKeyArray,
         dt: Float[Array, ""],
-        counts: tuple[Int[Array, ""] | None, Int[Array, ""] | None],
-        time: Float[Array, ""],
+        counts: SubsetCounts,
+        largest: SubsetCounts,
         place: int,
     ) -> DSMCGas:
         """Apply half of the kicks of a step, at its start (place 0) or end (1).
 
-        `counts` are the number of subsets of this replica and the largest of any replica.
+        `start` is the gas before the step.
         """
-        kicked, largest = counts
-        if kicked is None or largest is None:
+        count = counts.kicked
+        if count is None or largest.kicked is None:
             return gas
+        scene = self.scene
         d = self.scheme.dimension
-        parts = num_subsets(self.scheme.num_particles)
-        growth = self.kick_growth(time, dt, float(place))
-        key = jax.random.fold_in(key, 2 + place)
-        at_rest = self.scene.walls is None
-        size = jnp.sqrt(growth / 2 * (parts / kicked).astype(growth.dtype))
-        time = gas.time
+        subsets = num_subsets(self.scheme.num_particles)
+        growth = kick_growth(scene.drive, scene.drag, start.time, dt, float(place))
+        key = jax.random.fold_in(key, KICK_STREAMS[place])
+        zero_momentum = scene.walls is None
+        size = jnp.sqrt(growth / 2 * (subsets / count).astype(growth.dtype))
 
         def kick(i: Array, rows: Array, belongs: Array) -> tuple[Array, Array]:
-            v = rows[:, :d]
-            kicks = random_kicks(jax.random.fold_in(key, i), v, at_rest, belongs)
+            v, spin, at_zero = split_columns(rows, d)
+            kicks = random_kicks(jax.random.fold_in(key, i), v, zero_momentum, belongs)
             kicks = jnp.where(belongs[:, None], size * kicks, 0.0)
-            after = [v + kicks, rows[:, d:-d], rows[:, -d:] - time * kicks]
+            after = [v + kicks, spin, at_zero - gas.time * kicks]
             return jnp.concatenate(after, axis=-1), jnp.sum(kicks * (2 * v + kicks))
 
-        first = kicked * (2 * gas.steps + place).astype(jnp.int32)
+        first = count * (2 * gas.steps + place).astype(jnp.int32)
         zero = jnp.zeros((), growth.dtype)
-        particles, gain = change_subsets(gas.particles, first, kicked, largest, kick, zero)
+        particles, gain = change_subsets(gas.particles, first, count, largest.kicked, kick, zero)
         grown = 2 * gain / (self.scheme.num_particles * d)
         return gas._replace(particles=particles, temperature=gas.temperature + grown)
 
     def _collide(
         self, gas: DSMCGas, key: PRNGKeyArray, dt: Float[Array, ""], chance: Float[Array, ""]
-    ) -> tuple[Float[Array, "N components"], Outcome, EnergyGains]:
-        """Return the particles after the collisions of a step, sums over them, and gains."""
+    ) -> tuple[Float[Array, "N components"], EnergyGains, Float[Array, ""], Float[Array, ""]]:
+        """Return the particles after the collisions of a step, gains, and numbers of collisions.
+
+        The numbers are of collisions that happened, and of missed ones.
+        """
         d = self.scheme.dimension
         first = self.scheme.first
         second = self.scheme.second
-        bits = random_words(jax.random.fold_in(key, 0), first + second + 2)
+        bits = random_words(jax.random.fold_in(key, COLLISION_STREAM), first + second + 2)
         i, j, k = draw_pairs(bits[:, -2:].ravel(), self.scheme)
         index = jnp.concatenate([i, j, k])
         options = {"mode": "promise_in_bounds", "unique_indices": True}
@@ -504,10 +586,16 @@ class DSMCDynamics(AbstractDynamics):
 
         def collided(relative: Array, spins: Array, bits: Array) -> tuple[EnergyGains, Outcome]:
             def of_scene(
-                scene: ReducedScene, decay: DragDecay, faster: Array, turning: Array
+                scene: ReducedScene, decay: DragDecay, velocity_factor: Array, spin_factor: Array
             ) -> tuple[Array, Outcome]:
                 outcome = collide(
-                    relative * faster, bits, ceiling, chance, scene, spins * turning, decay.velocity
+                    relative * velocity_factor,
+                    bits,
+                    ceiling,
+                    chance,
+                    scene,
+                    spins * spin_factor,
+                    decay.velocity,
                 )
                 gains = outcome.gains.at[1:].divide(decay.spin**2)
                 return gains, outcome._replace(spin_change=outcome.spin_change / decay.spin)
@@ -524,84 +612,53 @@ class DSMCDynamics(AbstractDynamics):
         kicks = jnp.concatenate([kick[:second] + two.kick, kick[second:], -kick, -two.kick])
         turns = [turn[:second] + two.spin_change, turn[second:], turn, two.spin_change]
         changes = [kicks, jnp.concatenate(turns), -middle * kicks]
-        sums = one._replace(num=one.num + two.num, missed=one.missed + two.missed)
         particles = gas.particles.at[index].add(jnp.concatenate(changes, axis=-1), **options)
-        return particles, sums, jax.tree.map(jnp.add, gains, more)
+        gains = jax.tree.map(jnp.add, gains, more)
+        return particles, gains, one.num + two.num, one.missed + two.missed
 
     def _hit_walls(
         self,
         gas: DSMCGas,
         key: PRNGKeyArray,
         dt: Float[Array, ""],
-        particles: Float[Array, "N components"],
-        counts: tuple[Any, Any],
+        counts: SubsetCounts,
+        largest: SubsetCounts,
+        gains: EnergyGains,
     ) -> tuple[Float[Array, "N components"], EnergyGains]:
         """Let particles hit walls in a step, independent of their places.
 
-        A sphere between two walls hits one of them ``|v| ds/(L - sigma)`` times in a step, times
-        the ratio of the density before walls to the mean (`wall_impact_ratio`). Each step has walls
-        across one axis, in turn, with d times this number of impacts.
+        Args:
+            gas: after the collisions of the step, at the time before it.
+            key: of the random numbers of the step.
+            dt: length of the step.
+            counts: numbers of subsets of this replica.
+            largest: the largest of all replicas.
+            gains: by the collisions of the step.
 
-        Returns the particles and the gains.
+        Returns:
+            The particles, and the gains of the step.
         """
+        count = counts.at_walls
+        if count is None or largest.at_walls is None:
+            return gas.particles, gains
         d = self.scheme.dimension
+        key = jax.random.fold_in(key, WALL_STREAM)
+        subsets = num_subsets(self.scheme.num_particles)
         middle = gas.time + dt / 2
         axis = (gas.steps % d).astype(jnp.int32)
-        across = (jnp.arange(d, dtype=jnp.int32) == axis).astype(particles.dtype)[None]
-        key = jax.random.fold_in(key, 1)
-        (drawn, largest) = counts
-        parts = num_subsets(len(particles))
 
         def hit_rows(i: Array, rows: Array, belongs: Array) -> tuple[Array, EnergyGains]:
             bits = jax.random.bits(jax.random.fold_in(key, i), belongs.shape, jnp.uint16)
-            share = (drawn / parts).astype(particles.dtype)
-            chance = (bits.astype(particles.dtype) + 0.5) * 2.0**-16 * share
-            chance = jnp.where(belongs, chance, jnp.inf)
-
-            def of_scene(
-                scene: ReducedScene, decay: DragDecay, faster: Array, turning: Array
-            ) -> tuple[Array, tuple[Array, Array]]:
-                """Return the gains, and velocities and spins after impacts."""
-                velocity = rows[:, :d] * faster
-                spin = rows[:, d:-d] * turning
-                walls = scene.walls
-                surface = scene.surface
-                frequency = walls.frequency[axis]
-                normal = jnp.sum(velocity * across, axis=1)
-                speed = jnp.abs(normal)
-                outwards = jnp.sign(normal)[:, None] * across
-                eps = walls.law.restitution(jnp.where(speed > 0, speed * decay.velocity, 1.0))
-                ratio = wall_impact_ratio(eps, frequency / collision_rate(0.0, d), d)
-                often = ratio * (frequency * (d * sqrt(pi)) * dt) * speed
-                hits = (chance < often) & (speed > 0)
-                push = jnp.where(hits, (1 + eps) * speed, 0.0)
-                kick = -push[:, None] * outwards
-                spin_change = jnp.zeros_like(spin)
-                if surface is not None and walls.surface is not None:
-                    eta = surface.eta_on_wall(walls.surface)
-                    _, sliding_kick, spin_change = tangential_impulse(
-                        velocity, spin, outwards, hits, eta, surface, push
-                    )
-                    kick = kick + sliding_kick
-                # The number of impacts is not differentiable, so weights of value 1 carry its
-                # derivative.
-                weight = frequency * ratio
-                weight = (weight / jax.lax.stop_gradient(weight))[:, None]
-                gains = [jnp.sum(weight * kick * (2 * velocity + kick))]
-                if surface is not None:
-                    gain = jnp.sum(weight * spin_change * (2 * spin + spin_change))
-                    gains.append(surface.inertia * gain / decay.spin**2)
-                after = velocity + kick, (spin + spin_change) / decay.spin
-                return jnp.stack(gains), after
-
+            drawn_share = (count / subsets).astype(rows.dtype)
+            uniform = (bits.astype(rows.dtype) + 0.5) * 2.0**-16 * drawn_share
+            uniform = jnp.where(belongs, uniform, jnp.inf)
+            of_scene = partial(wall_impacts, rows=rows, axis=axis, uniform=uniform, dt=dt)
             gains, (velocity, spin) = self._exchanged(of_scene, middle, gas.tangents)
             return jnp.concatenate([velocity, spin, rows[:, -d:]], axis=-1), gains
 
-        shapes = jax.eval_shape(hit_rows, jnp.int32(0), particles[:1], jnp.ones(1, bool))[1]
-        zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
         bits = jax.random.bits(jax.random.fold_in(key, MAX_SUBSETS), (), jnp.uint16)
-        first = (bits % parts).astype(jnp.int32)
-        return change_subsets(particles, first, drawn, largest, hit_rows, zero)
+        first = (bits % subsets).astype(jnp.int32)
+        return change_subsets(gas.particles, first, count, largest.at_walls, hit_rows, gains)
 
     def _exchanged(
         self,
@@ -617,22 +674,20 @@ class DSMCDynamics(AbstractDynamics):
             middle: the time.
             tangents: of the gas; None for gains without tangents.
         """
-        if tangents is None:
-            decay = drag_decay(self.scene.drag, middle)
-            gains, others = of_scene(self.scene, decay, jnp.ones_like(middle), decay.spin)
-            return EnergyGains(gains), others
 
         def gained(scene: ReducedScene, log_scales: Float[Array, "energies"]) -> tuple[Array, Any]:
             decay = drag_decay(scene.drag, middle)
-            faster = jnp.exp(log_scales[0])
-            turning = decay.spin
+            spin_factor = decay.spin
             if scene.surface is not None:  # at a given energy a larger inertia has smaller spins
                 inertia = scene.surface.inertia
-                smaller = jnp.sqrt(jax.lax.stop_gradient(inertia) / inertia)
-                turning = turning * jnp.exp(log_scales[1]) * smaller
-            return of_scene(scene, decay, faster, turning)
+                inertia_factor = jnp.sqrt(jax.lax.stop_gradient(inertia) / inertia)
+                spin_factor = spin_factor * jnp.exp(log_scales[1]) * inertia_factor
+            return of_scene(scene, decay, jnp.exp(log_scales[0]), spin_factor)
 
         same = jnp.zeros(self.num_energies, middle.dtype)
+        if tangents is None:
+            gains, others = gained(self.scene, same)
+            return EnergyGains(gains), others
         gains, pull, others = jax.vjp(gained, self.scene, same, has_aux=True)
 
         def slopes(weights: Array) -> tuple[Array, Array]:
@@ -643,7 +698,7 @@ class DSMCDynamics(AbstractDynamics):
         return EnergyGains(gains, by_direction.T, by_scale.T), others
 
     def _tangents_after(
-        self, before: DSMCGas, gains: EnergyGains, ds: Array, collisions: Array
+        self, start: DSMCGas, gains: EnergyGains, ds: Array, collisions: Array
     ) -> ExchangeTangents:
         """Return the tangents after a step with some gains by impacts, and the kicks of a drive."""
         d = self.scheme.dimension
@@ -653,27 +708,21 @@ class DSMCDynamics(AbstractDynamics):
         if scene.drive is not None:
 
             def heating(scene: ReducedScene) -> Array:
-                kicks = partial(kick_variance, scene.drive, scene.drag, before.time, ds)
+                kicks = partial(kick_growth, scene.drive, scene.drag, start.time, ds)
                 return self.scheme.num_particles * d / 2 * (kicks(0.0) + kicks(1.0))
 
             heat, pull = jax.vjp(heating, scene)
             (in_scene,) = pull(jnp.ones_like(heat))
-            slopes = directional_slopes(in_scene, before.tangents.directions)
+            slopes = directional_slopes(in_scene, start.tangents.directions)
             values = values.at[0].add(heat)
             by_direction = by_direction.at[:, 0].add(slopes)
             # The rate of impacts depends on the speeds; kicks do not depend on them.
             by_scale = by_scale.at[0, 0].add(-heat)
-        energies = [jnp.sum(before.particles[:, :d] ** 2)]
+        velocity, spin, _ = split_columns(start.particles, d)
+        energies = [jnp.sum(velocity**2)]
         if scene.surface is not None:
-            energies.append(scene.surface.inertia * jnp.sum(before.particles[:, d:-d] ** 2))
-        return before.tangents.after(
-            jnp.stack(energies), values, by_direction, by_scale, collisions
-        )
-
-
-def time_left(gas: DSMCGas, until: ArrayLike) -> Float[Array, "*replicas"]:
-    """Return the time from each replica to a time."""
-    return (jnp.asarray(until) - gas.time) - gas.time_rest
+            energies.append(scene.surface.inertia * jnp.sum(spin**2))
+        return start.tangents.after(jnp.stack(energies), values, by_direction, by_scale, collisions)
 
 
 @jax.jit
@@ -681,8 +730,9 @@ def dsmc_records(dynamics: DSMCDynamics, state: DSMCState) -> Records:
     """Return the records of a state."""
     scene = dynamics.scene
     gas = state.shown
-    replicas, n, d = dynamics.shape
-    velocity = v = gas.particles[..., :d]
+    _, n, d = dynamics.shape
+    v, spin, at_zero = split_columns(gas.particles, d)
+    velocity = v
     if scene.walls is None:  # walls stop the gas as a whole
         velocity = v - jnp.mean(v, axis=1, keepdims=True)
     decay = drag_decay(scene.drag, state.time)
@@ -695,12 +745,12 @@ def dsmc_records(dynamics: DSMCDynamics, state: DSMCState) -> Records:
         "collisions": 2 / n * gas.collisions,
     }
     if scene.walls is None:  # walls would limit <dr^2>
-        position = gas.particles[..., -d:] + gas.time[:, None, None] * v
+        position = at_zero + gas.time[:, None, None] * v
         displacement = position - jnp.mean(position, axis=1, keepdims=True)
         values["displacement"] = observables.mean_square_displacement(displacement)
     if scene.surface is not None:
-        energy = 2 * scene.surface.inertia * jnp.mean(gas.particles[..., d:-d] ** 2, (1, 2))
-        values["rotational_temperature"] = energy * decay.true_spin**2
+        rotational = 2 * scene.surface.inertia * jnp.mean(spin**2, (1, 2))
+        values["rotational_temperature"] = rotational * decay.true_spin**2
     tangents = gas.tangents
     if tangents is None:
         return Records(values, {}, {})

@@ -19,11 +19,12 @@ from jaxgran.gradients.tangents import ExchangeTangents
 from jaxgran.particles import neighbours
 from jaxgran.particles.bit_masks import rows_where
 from jaxgran.particles.capacity import Capacity
+from jaxgran.particles.dynamics import time_left
 from jaxgran.particles.elements import (
     MAX_KICK,
     drag_decay,
     exchange_slopes,
-    kick_variance,
+    kick_growth,
     random_kicks,
     threefry_key,
 )
@@ -35,13 +36,12 @@ from jaxgran.particles.spheres import (
     AbstractSphereDynamics,
     Segment,
     SphereState,
-    advance_time,
+    advance_to_end,
     common_values,
     fastest,
     kinetic_energy,
     repeat_until,
     temperature,
-    time_left,
     with_dissipated_energy,
 )
 from jaxgran.particles.start import initial_spins
@@ -231,7 +231,7 @@ class HardDynamics(AbstractSphereDynamics):
         too_fast = jnp.any(work.max_speed2 > member_bound**2)
         new = self._state_after_window(kicked, candidates, work, duration)
         new = self._apply_drive(new, duration, 1.0)
-        new = advance_time(new, duration, end, num_left <= 1)
+        new = advance_to_end(new, duration, end, num_left <= 1)
 
         distance2 = jnp.max(jnp.sum((new.position - listed) ** 2, -1))
         exceeded = jnp.maximum(distance2, jnp.max(work.max_distance2)) > (0.5 * old.skin) ** 2
@@ -446,7 +446,7 @@ def drive_variance(
 ) -> Float[Array, ""]:
     """Return the variance of half of the kicks of a window, at its begin (place 0) or end (1)."""
     strength = scene.material.drive * scene.collision_frequency
-    return kick_variance(strength, scene.drag_rates, start, jnp.asarray(duration), place)
+    return kick_growth(strength, scene.drag_rates, start, jnp.asarray(duration), place)
 
 
 def _sum_by_replica(values: Array, candidates: ImpactCandidates, replicas: int) -> Array:

@@ -21,6 +21,7 @@ from jaxgran.gradients.tangents import ContactTangents, RateSums, component_alon
 from jaxgran.particles import neighbours, observables
 from jaxgran.particles.bit_masks import rows_where
 from jaxgran.particles.capacity import Capacity, max_skin
+from jaxgran.particles.dynamics import time_left
 from jaxgran.particles.neighbours import Pairs, select_members
 from jaxgran.particles.soft.forces import (
     PAIR,
@@ -39,14 +40,13 @@ from jaxgran.particles.spheres import (
     AbstractSphereDynamics,
     Segment,
     SphereState,
-    advance_time,
+    advance_to_end,
     centred,
     common_values,
     fastest,
     kinetic_energy,
     peculiar_velocity,
     repeat_until,
-    time_left,
     with_dissipated_energy,
 )
 from jaxgran.particles.start import initial_spins
@@ -234,7 +234,7 @@ class SoftDynamics(AbstractSphereDynamics):
         reach = (REACH_MARGIN * speed * retry.reach_factor + from_contacts) * duration
         candidates = self._select_candidates(old, pairs, duration, 2 * reach, retry.extra)
         block = self._integrate_block(old, candidates, duration)
-        new = advance_time(block.state, duration, end, num_left <= 1)
+        new = advance_to_end(block.state, duration, end, num_left <= 1)
 
         # A sphere outside the candidates was hit, or one went farther than the reach.
         too_far = block.max_square_move > reach**2
