@@ -28,13 +28,16 @@ class DragDecay(NamedTuple):
 
     Attributes:
         velocity: true over stored velocities, v over u: ``exp(-gamma t)``.
-        spin: true over stored spins, divided by `velocity`: spins in the unit of u.
-        true_spin: true over stored spins.
+        spin: true over stored spins.
     """
 
     velocity: Float[Array, "..."]
     spin: Float[Array, "..."]
-    true_spin: Float[Array, "..."]
+
+    @property
+    def spin_over_velocity(self) -> Float[Array, "..."]:
+        """Spins in the unit of u over stored spins."""
+        return self.spin / self.velocity
 
 
 def drag_decay(drag: ReducedDrag | None, time: Float[Array, "..."]) -> DragDecay:
@@ -46,11 +49,11 @@ def drag_decay(drag: ReducedDrag | None, time: Float[Array, "..."]) -> DragDecay
     """
     if drag is None:
         one = jnp.ones_like(time)
-        return DragDecay(one, one, one)
+        return DragDecay(one, one)
     velocity = 1 - drag.rate * time
     rotational_rate = 0.0 if drag.rotational_rate is None else drag.rotational_rate
     spin = jnp.exp(-rotational_rate * true_duration(drag, 0.0, time))
-    return DragDecay(velocity, spin / velocity, spin)
+    return DragDecay(velocity, spin)
 
 
 SERIES_LIMIT = 0.01
@@ -108,23 +111,23 @@ def exchange_slopes(
         The derivatives in time, and along the directions, as in `jaxgran.gradients.rule.Records`.
     """
     n, d = size
-    decay = jnp.zeros(2)
-    decay_slopes = jnp.zeros((1, 2))
+    log_decay = jnp.zeros(2)
+    log_decay_slopes = jnp.zeros((1, 2))
     if drag is not None:
 
         def logarithms(drag: ReducedDrag) -> Array:
-            left = drag_decay(drag, time)
-            return jnp.log(jnp.stack([left.velocity, left.true_spin]))
+            decay = drag_decay(drag, time)
+            return jnp.log(jnp.stack([decay.velocity, decay.spin]))
 
-        decay, linear = jax.linearize(logarithms, drag)
-        decay_slopes = jax.vmap(linear)(drag_directions)
+        log_decay, linear = jax.linearize(logarithms, drag)
+        log_decay_slopes = jax.vmap(linear)(drag_directions)
     slopes = {"collisions": 2 / n * tangents.collisions}
     components = {"temperature": d, "rotational_temperature": NUM_SPIN_COMPONENTS[d]}
     for k, (name, count) in enumerate(components.items()):
         if name in values:
             energy = n * count / 2
-            moved = jnp.exp(2 * decay[k]) * tangents.energies[:, k] / energy
-            slopes[name] = moved + 2 * decay_slopes[:, k, None] * values[name][None]
+            by_energy = jnp.exp(2 * log_decay[k]) * tangents.energies[:, k] / energy
+            slopes[name] = by_energy + 2 * log_decay_slopes[:, k, None] * values[name][None]
     elapsed = jnp.where(time > 0, time, 1.0)  # the last direction is the direction of time
     rates = {name: x[-1] / elapsed for name, x in slopes.items()}
     return rates, {name: x[:-1] for name, x in slopes.items()}
@@ -172,8 +175,7 @@ def random_kicks(
     if not zero_momentum:
         return kicks
     if kicked is None:
-        n = len(velocity)
-        return (n / (n - 1)) ** 0.5 * (kicks - jnp.mean(kicks, axis=0, keepdims=True))
+        kicked = jnp.ones(len(velocity), bool)
     n = jnp.maximum(jnp.sum(kicked), 2).astype(velocity.dtype)
     mean = jnp.sum(jnp.where(kicked[:, None], kicks, 0.0), axis=0, keepdims=True) / n
     return jnp.sqrt(n / (n - 1)) * (kicks - mean)
@@ -194,7 +196,7 @@ def random_words(key: PRNGKeyArray, count: int) -> UInt32[Array, "2 count"]:
     return threefry_2x32((first, second), counters).reshape(2, count)
 
 
-def surface_direction(
+def surface_velocity(
     spin: Float[Array, "pairs spins"], normal: Float[Array, "pairs d"]
 ) -> Float[Array, "pairs d"]:
     """Return ``s x n``, the velocity of the surface at the point in direction n."""
@@ -237,7 +239,7 @@ def tangential_impulse(
         first partner, and the spin change, the same for both partners.
     """
     sideways = relative - jnp.sum(relative * normal, axis=-1, keepdims=True) * normal
-    slip = jnp.where(where[:, None], sideways + surface_direction(spin, normal), 0.0)
+    slip = jnp.where(where[:, None], sideways + surface_velocity(spin, normal), 0.0)
     kick = -eta * slip
     if surface.friction is not None:
         square = jnp.sum(kick**2, axis=-1)

@@ -240,8 +240,8 @@ def wall_impacts(
     gains = [jnp.sum(weight * kick * (2 * velocity + kick))]
     if surface is not None:
         gain = jnp.sum(weight * spin_change * (2 * spin + spin_change))
-        gains.append(surface.inertia * gain / decay.spin**2)
-    return jnp.stack(gains), (velocity + kick, (spin + spin_change) / decay.spin)
+        gains.append(surface.inertia * gain / decay.spin_over_velocity**2)
+    return jnp.stack(gains), (velocity + kick, (spin + spin_change) / decay.spin_over_velocity)
 
 
 class DSMCDynamics(AbstractDynamics):
@@ -368,7 +368,7 @@ class DSMCDynamics(AbstractDynamics):
         velocity = (velocity * decay.velocity).reshape(-1, d)
         spin = None
         if self.scene.surface is not None:
-            spin = (spins * decay.true_spin).reshape(-1, spins.shape[-1])
+            spin = (spins * decay.spin).reshape(-1, spins.shape[-1])
         return jnp.full_like(velocity, jnp.nan), velocity, spin
 
     def max_wall_impacts(
@@ -597,8 +597,10 @@ class DSMCDynamics(AbstractDynamics):
                     spins * spin_factor,
                     decay.velocity,
                 )
-                gains = outcome.gains.at[1:].divide(decay.spin**2)
-                return gains, outcome._replace(spin_change=outcome.spin_change / decay.spin)
+                gains = outcome.gains.at[1:].divide(decay.spin_over_velocity**2)
+                return gains, outcome._replace(
+                    spin_change=outcome.spin_change / decay.spin_over_velocity
+                )
 
             return self._exchanged(of_scene, middle, gas.tangents)
 
@@ -677,7 +679,7 @@ class DSMCDynamics(AbstractDynamics):
 
         def gained(scene: ReducedScene, log_scales: Float[Array, "energies"]) -> tuple[Array, Any]:
             decay = drag_decay(scene.drag, middle)
-            spin_factor = decay.spin
+            spin_factor = decay.spin_over_velocity
             if scene.surface is not None:  # at a given energy a larger inertia has smaller spins
                 inertia = scene.surface.inertia
                 inertia_factor = jnp.sqrt(jax.lax.stop_gradient(inertia) / inertia)
@@ -750,7 +752,7 @@ def dsmc_records(dynamics: DSMCDynamics, state: DSMCState) -> Records:
         values["displacement"] = observables.mean_square_displacement(displacement)
     if scene.surface is not None:
         rotational = 2 * scene.surface.inertia * jnp.mean(spin**2, (1, 2))
-        values["rotational_temperature"] = rotational * decay.true_spin**2
+        values["rotational_temperature"] = rotational * decay.spin**2
     tangents = gas.tangents
     if tangents is None:
         return Records(values, {}, {})

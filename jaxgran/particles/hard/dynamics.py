@@ -159,7 +159,7 @@ class HardDynamics(AbstractSphereDynamics):
     def true_velocities(self, state: SphereState) -> tuple[Array, Array | None]:
         decay = drag_decay(self.scene.drag_rates, state.time + state.time_rest)
         spin = state.internal.spin
-        return state.velocity * decay.velocity, None if spin is None else spin * decay.true_spin
+        return state.velocity * decay.velocity, None if spin is None else spin * decay.spin
 
     def observe(self, state: SphereState) -> Records:
         return hard_records(state, self.scene, self.replicas)
@@ -492,7 +492,7 @@ def _values_with_elements(
     d = state.velocity.shape[1]
     decay = drag_decay(scene.drag_rates, state.time + state.time_rest)
     velocity_factor = decay.velocity
-    spin_factor = decay.true_spin
+    spin_factor = decay.spin
     initial = kinetic_energy(state.first_velocity, replicas) / n
     lost = initial - velocity_factor**2 * (initial - state.dissipated / n)
     changed = {

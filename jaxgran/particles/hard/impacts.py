@@ -113,7 +113,7 @@ def impact_effect(
         rotational_gain = spin_change[:, 0]
         if axis is None or material.walls.surface is not None:
             eta = surface.eta if axis is None else surface.eta_on_wall(material.walls.surface)
-            spin_factor = decay.spin[:, None]
+            spin_factor = decay.spin_over_velocity[:, None]
             spin = impact.spin * spin_factor
             push = -jnp.sum(kick * impact.normal, -1)
             sideways, sliding_kick, added_spin = tangential_impulse(

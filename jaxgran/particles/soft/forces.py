@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxgran.particles.elements import flight_time, surface_direction, torque
+from jaxgran.particles.elements import flight_time, surface_velocity, torque
 from jaxgran.scene.contact import contact_force, midpoint_rate
 from jaxgran.scene.gas import ReducedContact, ReducedFriction, ReducedScene, SphereScene
 
@@ -275,7 +275,7 @@ def integrate(
         for axis, unit in enumerate(jnp.eye(v.shape[1], dtype=v.dtype)):
             towards = outwards[:, axis, None] * unit[None]
             lever = 1 - 2 * depth[:, axis]  # distance from the wall
-            slip = v * (1 - unit)[None] + lever[:, None] * surface_direction(spin, towards)
+            slip = v * (1 - unit)[None] + lever[:, None] * surface_velocity(spin, towards)
             across = jax.tree.map(lambda x, axis=axis: x[:, axis], push)
             response = 1 + lever**2 / surface.inertia
             kick, taken = tangential_kick(slip, across, walls_material.surface, response, dt)
@@ -293,7 +293,7 @@ def integrate(
         lever = 1 - xi  # the distance of the centres
         relative = v[a] - v[b]
         sideways = relative - jnp.sum(relative * towards, -1, keepdims=True) * towards
-        slip = sideways + lever[:, None] * surface_direction(spin[a] + spin[b], towards)
+        slip = sideways + lever[:, None] * surface_velocity(spin[a] + spin[b], towards)
         response = 2 * (1 + lever**2 / surface.inertia)
         kick, lost = tangential_kick(slip, force, surface, response, dt)
         spin_change = (lever / surface.inertia)[:, None] * torque(towards, kick)
