@@ -18,6 +18,13 @@ from jaxgran.particles.bit_masks import WORD, bits_where, rows_where
 from jaxgran.particles.cell_list import STEPS, cells, num_words_ahead, reach_in_steps
 
 
+def marked(
+    mask: Bool[Array, "n"], rows: Int[Array, "..."], where: Bool[Array, "..."]
+) -> Bool[Array, "n"]:
+    """Return a mask that is also True in some rows, where a condition holds for them."""
+    return mask.at[jnp.where(where, rows, len(mask))].set(True, mode="drop")
+
+
 def select_members(
     selected: Bool[Array, "all"],
     i: Int[Array, "all"],
@@ -42,7 +49,7 @@ def select_members(
     real = jnp.arange(capacity[0], dtype=jnp.int32) < num_rows
     rows = jnp.where(real, rows, 0)
     ends = jnp.stack([i[rows], j[rows]])
-    is_member = others.at[jnp.where(real[None], ends, n)].set(True, mode="drop")
+    is_member = marked(others, ends, real[None])
     members, num_members = rows_where(is_member, capacity[1])
     slots = jnp.arange(capacity[1], dtype=jnp.int32)
     slot = jnp.zeros(n, jnp.int32).at[members].set(slots, mode="drop")
@@ -189,6 +196,11 @@ class Pairs(NamedTuple):
     offset: Float[Array, "pairs d"]
     count: Int[Array, ""]
     lookahead: Int[Array, ""]
+
+    @property
+    def in_use(self) -> Bool[Array, "pairs"]:
+        """Whether each row holds a pair."""
+        return jnp.arange(len(self.i), dtype=jnp.int32) < self.count
 
 
 def wrap(side: ArrayLike, position: Float[Array, "n d"]) -> Float[Array, "n d"]:

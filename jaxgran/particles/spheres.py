@@ -20,7 +20,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 from jaxgran._utils import status
 from jaxgran.particles import neighbours, observables
 from jaxgran.particles.capacity import Capacity, skin_for_pairs
-from jaxgran.particles.dynamics import AbstractDynamics, advance_time
+from jaxgran.particles.dynamics import AbstractDynamics, advance_time, time_left
 from jaxgran.particles.neighbours import ListedPairs, Pairs
 from jaxgran.particles.start import (
     Placement,
@@ -403,13 +403,24 @@ def min_duration(state: SphereState) -> Float[Array, ""]:
     return jnp.where(speed > 0, MIN_FLIGHT / jnp.where(speed > 0, speed, 1.0), 0.0)
 
 
+def next_block(
+    state: SphereState, longest: Float[Array, ""], end: ArrayLike
+) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    """Return the duration of the next of equal blocks until an end, and whether it is the last."""
+    duration = time_left(state, end)
+    # Rounding errors of a whole number of blocks do not make one more.
+    num_left = jnp.maximum(jnp.ceil(duration / longest * (1 - 1e-9)), 1.0)
+    return duration / num_left, num_left <= 1
+
+
 def advance_to_end(
-    state: SphereState, duration: ArrayLike, end: ArrayLike, at_end: ArrayLike
+    state: SphereState, duration: ArrayLike, end: ArrayLike, is_last: ArrayLike
 ) -> SphereState:
-    """Advance the time of a state by a duration, or exactly to the end."""
+    """Advance the time of a state by a block, the last one of which leads exactly to the end."""
     later = advance_time(state, duration)
     return later._replace(
-        time=jnp.where(at_end, end, later.time), time_rest=jnp.where(at_end, 0.0, later.time_rest)
+        time=jnp.where(is_last, end, later.time),
+        time_rest=jnp.where(is_last, 0.0, later.time_rest),
     )
 
 

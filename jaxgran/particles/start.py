@@ -165,7 +165,6 @@ class Placement(AbstractProcess):
     def advance(self, state: PlacementState, until: ArrayLike) -> PlacementState:
         """Build a neighbour list, and push until it is stale or no overlap is left."""
         side = self.side
-        max_pairs = self.capacity.pairs
         replicas, num_particles, dimension = self.shape
         built = neighbours.wrap(side, state.position)
         cutoff = 1 + self.skin
@@ -175,7 +174,6 @@ class Placement(AbstractProcess):
         pairs = neighbours.with_offsets(built, side, listed)
         needed = jnp.zeros_like(state.needed).at[:2].set(jnp.stack([pairs.count, pairs.lookahead]))
         full = self.capacity.exceeded_by(needed)
-        in_use = jnp.arange(max_pairs, dtype=jnp.int32) < pairs.count
         volume = side**dimension if self.region is None else jnp.prod(self.region + 1)
         per_sphere = sphere_surface(dimension) / dimension / 2**dimension
         packing_fraction = num_particles * per_sphere / volume
@@ -195,7 +193,7 @@ class Placement(AbstractProcess):
             # Coincident points are separated along the first axis.
             first_axis = jnp.zeros_like(separation).at[:, 0].set(COINCIDENT)
             separation = jnp.where((square > 0)[:, None], separation, first_axis)
-            close = in_use & (distance < 1 + GAP / 2)
+            close = pairs.in_use & (distance < 1 + GAP / 2)
             shift = GOLDEN_RATIO * state.num_pushes.astype(x.dtype)
             share = state.share[pairs.i] + state.share[pairs.j] + shift
             target = 1 + GAP + extra_gap * (share - jnp.floor(share))

@@ -40,6 +40,7 @@ from jaxgran.particles.spheres import (
     common_values,
     fastest,
     kinetic_energy,
+    next_block,
     repeat_until,
     temperature,
     with_dissipated_energy,
@@ -135,7 +136,9 @@ class HardDynamics(AbstractSphereDynamics):
         rate = self.scene.collision_frequency
         if self.region is not None:
             rate = rate + 2 / jnp.min(self.region)
-        spin = gain = counted_key = None
+        spin = None
+        gain = None
+        counted_key = None
         if material.surface is not None:
             mean_square = (material.surface.ratio / material.surface.inertia).astype(dtype)
             spin = initial_spins(key, self.shape, mean_square)
@@ -203,8 +206,7 @@ class HardDynamics(AbstractSphereDynamics):
         container = self.scene.container
         separation = x[pairs.i] - x[pairs.j] - pairs.offset
         square = jnp.sum(separation * separation, -1)
-        in_use = jnp.arange(len(square), dtype=jnp.int32) < pairs.count
-        closest = jnp.sqrt(jnp.min(jnp.where(in_use, square, 1.0), initial=1.0))
+        closest = jnp.sqrt(jnp.min(jnp.where(pairs.in_use, square, 1.0), initial=1.0))
         if container is not None:  # a sphere and its image beyond a wall
             closest = jnp.minimum(closest, 2 * jnp.min(jnp.minimum(x, container[None] - x)))
         return closest < 1 - allowed_overlap(x.dtype, side)
@@ -216,11 +218,8 @@ class HardDynamics(AbstractSphereDynamics):
         """
         old = now.state
         bound_factor = now.retry
-        time_until_end = time_left(old, end)
         scene = self.scene
-        window = self._window_length(old)
-        num_left = jnp.maximum(jnp.ceil(time_until_end / window * (1 - 1e-9)), 1.0)
-        duration = time_until_end / num_left
+        duration, is_last = next_block(old, self._longest_window(old), end)
         kicked = self._apply_drive(old, duration, 0.0)
         bound = SPEED_MARGIN * bound_factor * fastest(kicked.velocity, self.replicas)
         candidates = self._select_candidates(kicked, pairs, duration, bound)
@@ -231,7 +230,7 @@ class HardDynamics(AbstractSphereDynamics):
         too_fast = jnp.any(work.max_speed2 > member_bound**2)
         new = self._state_after_window(kicked, candidates, work, duration)
         new = self._apply_drive(new, duration, 1.0)
-        new = advance_to_end(new, duration, end, num_left <= 1)
+        new = advance_to_end(new, duration, end, is_last)
 
         distance2 = jnp.max(jnp.sum((new.position - listed) ** 2, -1))
         exceeded = jnp.maximum(distance2, jnp.max(work.max_distance2)) > (0.5 * old.skin) ** 2
@@ -272,7 +271,7 @@ class HardDynamics(AbstractSphereDynamics):
         # The listed pairs that can touch at the largest speeds are a small part of the list.
         displacement = x[pairs.i] - x[pairs.j] - pairs.offset
         gap = jnp.sqrt(jnp.sum(displacement * displacement, -1)) - 1
-        gap = jnp.where(jnp.arange(gap.size, dtype=jnp.int32) < pairs.count, gap, jnp.inf)
+        gap = jnp.where(pairs.in_use, gap, jnp.inf)
         near, num_near = rows_where(gap < 2 * bound[pairs.i // size] * duration, self.capacity.near)
         real = jnp.arange(self.capacity.near, dtype=jnp.int32) < num_near
         near = jnp.where(real, near, 0)
@@ -342,8 +341,8 @@ class HardDynamics(AbstractSphereDynamics):
     def recover(self, now: Segment, before: SphereState) -> SphereState:
         """Shorten the window if the skin was exceeded at once, and the skin of a crowded list."""
         state = now.state
-        fresh = state.time == before.time  # otherwise a new neighbour list is enough
-        shorten = status.has(state.status, status.SKIN_EXCEEDED) & fresh
+        has_not_moved = state.time == before.time  # otherwise a new neighbour list is enough
+        shorten = status.has(state.status, status.SKIN_EXCEEDED) & has_not_moved
         # Only with enough capacity, so that a resumed run with another capacity does the same.
         crowded = state.needed[0] > MAX_LISTED_PER_PARTICLE * len(state.position)
         crowded &= state.status == status.OK
@@ -374,7 +373,7 @@ class HardDynamics(AbstractSphereDynamics):
         internal = state.internal._replace(key=counted_key.at[2].add(jnp.uint32(1)))
         return state._replace(velocity=velocity, internal=internal)
 
-    def _window_length(self, state: SphereState) -> Float[Array, ""]:
+    def _longest_window(self, state: SphereState) -> Float[Array, ""]:
         """Return a length with which the kicks of a window are small beside the velocities."""
         if self.scene.material.drive is None:
             return state.internal.window

@@ -21,12 +21,13 @@ from jaxgran.gradients.tangents import ContactTangents, RateSums, component_alon
 from jaxgran.particles import neighbours, observables
 from jaxgran.particles.bit_masks import rows_where
 from jaxgran.particles.capacity import Capacity, max_skin
-from jaxgran.particles.dynamics import time_left
-from jaxgran.particles.neighbours import Pairs, select_members
+from jaxgran.particles.neighbours import Pairs, marked, select_members
 from jaxgran.particles.soft.forces import (
     PAIR,
     WALL,
+    BlockWork,
     ContactCandidates,
+    ContactWork,
     Spheres,
     block_members,
     elastic_energy,
@@ -45,6 +46,7 @@ from jaxgran.particles.spheres import (
     common_values,
     fastest,
     kinetic_energy,
+    next_block,
     peculiar_velocity,
     repeat_until,
     with_dissipated_energy,
@@ -127,6 +129,26 @@ class IntegratedBlock(NamedTuple):
     max_square_move: Float[Array, ""]
 
 
+class BlockContacts(NamedTuple):
+    """Contacts of a block, and energies of each replica.
+
+    Attributes:
+        lost: energy lost in contacts.
+        exchanged: see `IntegratedBlock`.
+        stored: elastic energy at the end.
+        begun: number of contacts that began.
+        touching: particles in contact at the end.
+        unexpected: see `IntegratedBlock`.
+    """
+
+    lost: Float[Array, "replicas"]
+    exchanged: Float[Array, "replicas"]
+    stored: Float[Array, "replicas"]
+    begun: Int[Array, "replicas"]
+    touching: Bool[Array, "n"]
+    unexpected: Bool[Array, "n"]
+
+
 class SoftDynamics(AbstractSphereDynamics):
     """Viscoelastic spheres in blocks of equal time steps.
 
@@ -207,7 +229,7 @@ class SoftDynamics(AbstractSphereDynamics):
         x = state.position
         material = self.scene.material
         xi, _, touching = overlap(x, pairs.i, pairs.j, pairs.offset)
-        touching &= jnp.arange(len(xi), dtype=jnp.int32) < pairs.count
+        touching &= pairs.in_use
         replica = pairs.i // (len(x) // self.replicas)
         law = _of_rows(material.law, replica)
         stored = elastic_energy(jnp.where(touching, xi, 0.0), law, PAIR)
@@ -226,7 +248,9 @@ class SoftDynamics(AbstractSphereDynamics):
         """Run one block, and accept it if all its contacts were expected and no check failed."""
         old = now.state
         retry = now.retry
-        duration, num_left, hottest = self._block_duration(old, end)
+        hottest = self._hottest(old)
+        longest = self._longest_block(old.internal.refinement, hottest)
+        duration, is_last = next_block(old, longest, end)
         # The fastest sphere of all replicas, which share their blocks.
         speed = jnp.max(fastest(old.velocity, self.replicas))
         # At rest the first reach is 0, and the next one is given by the energy in contacts.
@@ -234,7 +258,7 @@ class SoftDynamics(AbstractSphereDynamics):
         reach = (REACH_MARGIN * speed * retry.reach_factor + from_contacts) * duration
         candidates = self._select_candidates(old, pairs, duration, 2 * reach, retry.extra)
         block = self._integrate_block(old, candidates, duration)
-        new = advance_to_end(block.state, duration, end, num_left <= 1)
+        new = advance_to_end(block.state, duration, end, is_last)
 
         # A sphere outside the candidates was hit, or one went farther than the reach.
         too_far = block.max_square_move > reach**2
@@ -302,7 +326,7 @@ class SoftDynamics(AbstractSphereDynamics):
         max_near = self.capacity.near
         displacement = position[pairs.i] - position[pairs.j] - pairs.offset
         near = jnp.sum(displacement * displacement, -1) < (1 + margin) ** 2
-        near &= jnp.arange(near.size, dtype=jnp.int32) < pairs.count
+        near &= pairs.in_use
         rows, num_near = rows_where(near, max_near)
         real = jnp.arange(max_near, dtype=jnp.int32) < num_near
         i = pairs.i[rows]
@@ -318,18 +342,15 @@ class SoftDynamics(AbstractSphereDynamics):
         distance2 = jnp.sum(displacement * displacement, -1)
         touching = real & (distance2 + (2 * approach + speed2 * closest) * closest < 1.0)
 
-        def mark_ends(active, mask):
-            ends = jnp.where(mask[None], jnp.stack([i, j]), n)
-            return active.at[ends].set(True, mode="drop")
-
+        ends = jnp.stack([i, j])
         # The particles that would touch, those near them, and all pairs near these.
         alone = jnp.zeros(n, bool)
         if container is not None:
             before = position
             after = position + velocity * duration
             alone = extra | wall_overlap(container, before)[2] | wall_overlap(container, after)[2]
-        active = mark_ends(extra | alone, touching)
-        active = mark_ends(active, real & (active[i] | active[j]))
+        active = marked(extra | alone, ends, touching[None])
+        active = marked(active, ends, (real & (active[i] | active[j]))[None])
         selected = real & (active[i] | active[j])
         rows, real, members, (a, b), counts = select_members(
             selected, i, j, alone, self.capacity[3:]
@@ -348,9 +369,8 @@ class SoftDynamics(AbstractSphereDynamics):
             needed=jnp.stack([pairs.count, pairs.lookahead, num_near, *counts]),
         )
 
-    def _block_duration(self, state: SphereState, end: ArrayLike) -> tuple[Array, Array, Array]:
-        """Return the duration of the next block, the number of blocks of this length until the end,
-        and the temperature of the hottest replica, with the energy in its contacts."""
+    def _hottest(self, state: SphereState) -> Float[Array, ""]:
+        """Return the temperature of the hottest replica, with the energy in its contacts."""
         scene = self.scene
         velocity = centred(state.velocity, self.replicas)
         if not scene.galilean_invariant:  # walls and drag do not move with the centre of mass
@@ -361,117 +381,156 @@ class SoftDynamics(AbstractSphereDynamics):
         if state.internal.spin is not None:
             hottest_spins = rotational_temperature(scene, state.internal.spin, self.replicas)
             hottest = jnp.maximum(hottest, jnp.max(hottest_spins))
-        shortest_contact = scene.contact_duration
-        material = scene.material
+        return hottest
+
+    def _longest_block(
+        self, refinement: Float[Array, ""], hottest: Float[Array, ""]
+    ) -> Float[Array, ""]:
+        """Return the duration of a block of the longest steps at a temperature."""
+        shortest_contact = self.scene.contact_duration
+        material = self.scene.material
         if material.walls is not None:  # durations go as alpha^(-2/5) v^(-1/5)
             on_wall = shortest_contact * (material.law.alpha / material.walls.law.alpha) ** 0.4
             shortest_contact = jnp.minimum(shortest_contact, on_wall)
-        per_contact = self.steps_per_contact * state.internal.refinement
-        longest_step = shortest_contact * hottest**-0.1 / per_contact
-        longest = self.steps_per_block * longest_step
-        time_until_end = time_left(state, end)
-        num_left = jnp.maximum(jnp.ceil(time_until_end / longest * (1 - 1e-9)), 1.0)
-        return time_until_end / num_left, num_left, hottest
+        longest_step = shortest_contact * hottest**-0.1 / (self.steps_per_contact * refinement)
+        return self.steps_per_block * longest_step
 
     def _integrate_block(
         self, state: SphereState, candidates: ContactCandidates, duration: Array
     ) -> IntegratedBlock:
         """Integrate the candidates, and let all others fly."""
-        scene = self.scene
-        replicas = self.replicas
         members = candidates.members
-        n = len(state.position)
-        replica_of_particle = jnp.arange(n) // (n // replicas)
-        replica_of_member = jnp.minimum(members // (n // replicas), replicas - 1)
-
-        def move(spheres: Spheres, material: ReducedScene):
-            """Return all spheres after free flight, the members after the block, and energies."""
-            material = _with_surfaces(material, scene.material)
-            walls = material.walls
-            if walls is not None:
-                walls = walls._replace(law=_of_rows(walls.law, replica_of_member))
-            stepped, work = integrate(
-                scene,
-                block_members(scene, spheres, members),
-                material._replace(
-                    law=_of_rows(material.law, candidates.replica),
-                    walls=walls,
-                    drag=_of_rows(material.drag, replica_of_member),
-                ),
-                candidates,
-                duration,
-                self.steps_per_block,
-            )
-            drag = _of_rows(material.drag, replica_of_particle)
-            flown, lost_to_drag = fly(scene, spheres, duration, material._replace(drag=drag))
-            return (flown, stepped), (work, lost_to_drag)
-
-        def put_members(values: Array, new: Array) -> Array:
-            return values.at[members].set(new, mode="drop")
-
-        def sum_members(values: Array, others: ArrayLike = 0.0) -> Float[Array, "replicas"]:
-            all_particles = put_members(jnp.broadcast_to(others, (n,)).astype(values.dtype), values)
-            return jnp.sum(all_particles.reshape(replicas, -1), axis=1)
-
         spheres = Spheres(state.position, state.velocity, state.internal.spin)
         tangents = state.tangents
         if tangents is None or len(tangents.delay) == 0:
-            ends, (work, lost_to_drag) = move(spheres, scene.material)
+            ends, energies = self._moved(spheres, self.scene.material, candidates, duration)
         else:
-            material = _with_surfaces(scene.material)
-            material, material_tangents = _material_by_replica(material, tangents)
-            ends, end_tangents, (work, lost_to_drag) = jax.vmap(
-                lambda *tangent: jax.jvp(move, (spheres, material), tangent, has_aux=True),
-                out_axes=(None, 0, None),
-            )(Spheres(tangents.position, tangents.velocity, tangents.spin), material_tangents)
-            x, v, spin = jax.tree.map(jax.vmap(put_members), *end_tangents)
-            tangents = tangents._replace(position=x, velocity=v, spin=spin)
-        pairs, walls, member_loss = work
-        x, v, spin = jax.tree.map(put_members, *ends)
+            ends, energies, tangents = self._moved_tangents(spheres, tangents, candidates, duration)
+        after = jax.tree.map(partial(_put, members), *ends)
+        (pair_work, wall_work, member_loss), flight_loss = energies
+        contacts = self._contacts(candidates, pair_work, wall_work)
+        lost = contacts.lost
+        if member_loss is not None and flight_loss is not None:
+            lost = lost + self._sum_members(members, member_loss, flight_loss)
+        _, stepped = ends
+        moved = stepped.x - block_members(self.scene, spheres, members).x
+        new = state._replace(
+            position=after.x,
+            velocity=after.v,
+            dissipated=state.dissipated + lost,
+            collisions=state.collisions + contacts.begun.astype(state.collisions.dtype),
+            internal=state.internal._replace(elastic=contacts.stored, spin=after.spin),
+        )
+        if tangents is not None:
+            new = new._replace(tangents=tangents._replace(free=~contacts.touching))
+            new = new._replace(tangents=self._tangents_after(state, new, contacts, duration))
+        return IntegratedBlock(
+            state=new,
+            lost=lost,
+            exchanged=contacts.exchanged,
+            unexpected=contacts.unexpected,
+            max_square_move=jnp.max(jnp.sum(moved**2, -1)),
+        )
 
-        def mark(particles: Bool[Array, "n"], mask: Array, rows: Int[Array, "..."]) -> Array:
-            return particles.at[jnp.where(mask, rows, n)].set(True, mode="drop")
+    def _moved(
+        self,
+        spheres: Spheres,
+        material: ReducedScene,
+        candidates: ContactCandidates,
+        duration: Array,
+    ) -> tuple[tuple[Spheres, Spheres], tuple[BlockWork, Float[Array, "n"] | None]]:
+        """Return all spheres after free flight, the members after a block, and energies.
+
+        The energies are those of the block, and what each sphere lost to drag in free flight.
+        """
+        scene = self.scene
+        replicas, size, _ = self.shape
+        replica_of_particle = jnp.arange(replicas * size) // size
+        replica_of_member = jnp.minimum(candidates.members // size, replicas - 1)
+        material = _with_surfaces(material, scene.material)
+        walls = material.walls
+        if walls is not None:
+            walls = walls._replace(law=_of_rows(walls.law, replica_of_member))
+        stepped, work = integrate(
+            scene,
+            block_members(scene, spheres, candidates.members),
+            material._replace(
+                law=_of_rows(material.law, candidates.replica),
+                walls=walls,
+                drag=_of_rows(material.drag, replica_of_member),
+            ),
+            candidates,
+            duration,
+            self.steps_per_block,
+        )
+        drag = _of_rows(material.drag, replica_of_particle)
+        flown, flight_loss = fly(scene, spheres, duration, material._replace(drag=drag))
+        return (flown, stepped), (work, flight_loss)
+
+    def _moved_tangents(
+        self,
+        spheres: Spheres,
+        tangents: ContactTangents,
+        candidates: ContactCandidates,
+        duration: Array,
+    ) -> tuple[tuple[Spheres, Spheres], tuple[BlockWork, Any], ContactTangents]:
+        """Return what `_moved` returns, and the tangents of all spheres after the block."""
+        material = _with_surfaces(self.scene.material)
+        material, material_tangents = _material_by_replica(material, tangents)
+
+        def tangents_along(*direction: Any) -> tuple[Any, Any, Any]:
+            move = partial(self._moved, candidates=candidates, duration=duration)
+            return jax.jvp(move, (spheres, material), direction, has_aux=True)
+
+        along_all = jax.vmap(tangents_along, out_axes=(None, 0, None))
+        sphere_tangents = Spheres(tangents.position, tangents.velocity, tangents.spin)
+        ends, end_tangents, energies = along_all(sphere_tangents, material_tangents)
+        after = jax.tree.map(jax.vmap(partial(_put, candidates.members)), *end_tangents)
+        tangents = tangents._replace(position=after.x, velocity=after.v, spin=after.spin)
+        return ends, energies, tangents
+
+    def _contacts(
+        self,
+        candidates: ContactCandidates,
+        pair_work: ContactWork,
+        wall_work: ContactWork | None,
+    ) -> BlockContacts:
+        """Return the contacts in a block, of pairs and at walls."""
+        members = candidates.members
+        partners = members[jnp.stack([candidates.a, candidates.b], 1)]
+        replicas, size, _ = self.shape
+        none = jnp.zeros(replicas * size, bool)
 
         def sum_pairs(values: Array) -> Shaped[Array, "replicas"]:
             return jnp.zeros(replicas, values.dtype).at[candidates.replica].add(values)
 
-        lost = sum_pairs(pairs.dissipated)
-        exchanged = sum_pairs(pairs.exchanged)
-        stored = sum_pairs(pairs.stored)
-        partners = members[jnp.stack([candidates.a, candidates.b], 1)]
-        nowhere = jnp.zeros(n, bool)
-        surprise = pairs.touched & ~candidates.expected
-        touching = mark(nowhere, pairs.touching[:, None], partners)
-        unexpected = mark(nowhere, surprise[:, None], partners)
-        if walls is not None:
-            lost += sum_members(walls.dissipated)
-            exchanged += sum_members(walls.exchanged)
-            stored += sum_members(walls.stored)
-            touching = mark(touching, walls.touching, members)
-            surprise = walls.touched & ~candidates.expected_at_walls
-            unexpected = mark(unexpected, surprise, members)
-        lost_with_drag = lost
-        if member_loss is not None and lost_to_drag is not None:
-            lost_with_drag = lost + sum_members(member_loss, lost_to_drag)
-        begun = sum_pairs(pairs.begun)
-        moved = ends[1].x - block_members(scene, spheres, members).x
-        new = state._replace(
-            position=x,
-            velocity=v,
-            dissipated=state.dissipated + lost_with_drag,
-            collisions=state.collisions + begun.astype(state.collisions.dtype),
-            internal=state.internal._replace(elastic=stored, spin=spin),
+        surprise = pair_work.touched & ~candidates.expected
+        contacts = BlockContacts(
+            lost=sum_pairs(pair_work.dissipated),
+            exchanged=sum_pairs(pair_work.exchanged),
+            stored=sum_pairs(pair_work.stored),
+            begun=sum_pairs(pair_work.begun),
+            touching=marked(none, partners, pair_work.touching[:, None]),
+            unexpected=marked(none, partners, surprise[:, None]),
         )
-        if tangents is not None:
-            new = new._replace(tangents=tangents._replace(free=~touching))
-            new = new._replace(tangents=self._project_if_due(state, new, lost, begun, duration))
-        return IntegratedBlock(
-            state=new,
-            lost=lost_with_drag,
-            exchanged=exchanged,
-            unexpected=unexpected,
-            max_square_move=jnp.max(jnp.sum(moved**2, -1)),
+        if wall_work is None:
+            return contacts
+        surprise = wall_work.touched & ~candidates.expected_at_walls
+        return contacts._replace(
+            lost=contacts.lost + self._sum_members(members, wall_work.dissipated),
+            exchanged=contacts.exchanged + self._sum_members(members, wall_work.exchanged),
+            stored=contacts.stored + self._sum_members(members, wall_work.stored),
+            touching=marked(contacts.touching, members, wall_work.touching),
+            unexpected=marked(contacts.unexpected, members, surprise),
         )
+
+    def _sum_members(
+        self, members: Int[Array, "members"], values: Array, others: ArrayLike = 0.0
+    ) -> Float[Array, "replicas"]:
+        """Return the sums over each replica of values of its members and of all others."""
+        replicas, size, _ = self.shape
+        others = jnp.broadcast_to(others, (replicas * size,)).astype(values.dtype)
+        return jnp.sum(_put(members, others, values).reshape(replicas, -1), axis=1)
 
     def _energy(self, state: SphereState) -> Float[Array, "replicas"]:
         energy = kinetic_energy(state.velocity, self.replicas)
@@ -480,13 +539,10 @@ class SoftDynamics(AbstractSphereDynamics):
             energy += inertia * kinetic_energy(state.internal.spin, self.replicas)
         return energy + state.internal.elastic
 
-    def _project_if_due(
-        self, old: SphereState, new: SphereState, lost: Array, begun: Array, duration: Array
+    def _tangents_after(
+        self, old: SphereState, new: SphereState, contacts: BlockContacts, duration: Array
     ) -> ContactTangents:
-        """Return the tangents after a block, projected if a projection is due.
-
-        `lost` and `begun` are the energy lost in contacts, and the number of those that began.
-        """
+        """Return the tangents after a block with their rates, projected if that is due."""
         scene = self.scene
         replicas = self.replicas
         tangents = new.tangents
@@ -497,7 +553,8 @@ class SoftDynamics(AbstractSphereDynamics):
         passed = duration * jnp.sqrt(T)
         stored = new.internal.elastic
         trend = cooling_trend(scene, T)
-        collisions = 2 * replicas / len(new.position) * begun.astype(lost.dtype)
+        lost = contacts.lost
+        collisions = 2 * replicas / len(new.position) * contacts.begun.astype(lost.dtype)
         amounts = [lost, collisions]
         trends = [(energy + stored) * trend * duration, passed]
         spin = new.internal.spin
@@ -524,8 +581,8 @@ class SoftDynamics(AbstractSphereDynamics):
         """Halve a step that was too large, and lengthen a skin that was exceeded."""
         state = now.state
         longest = max_skin(self.scene.side)
-        fresh = state.time == before.time  # otherwise a new neighbour list is enough
-        exceeded = status.has(state.status, status.SKIN_EXCEEDED) & fresh
+        has_not_moved = state.time == before.time  # otherwise a new neighbour list is enough
+        exceeded = status.has(state.status, status.SKIN_EXCEEDED) & has_not_moved
         shorten = status.has(state.status, status.STEP_TOO_LARGE)
         shorten |= exceeded & (state.skin >= longest)
         unrecoverable = shorten & (state.internal.refinement >= MAX_REFINEMENT)
@@ -539,6 +596,11 @@ class SoftDynamics(AbstractSphereDynamics):
         )
 
 
+def _put(rows: Int[Array, "rows"], values: Array, new: Array) -> Array:
+    """Return values with new ones in some rows; rows beyond the last one are left out."""
+    return values.at[rows].set(new, mode="drop")
+
+
 def _of_rows(numbers: Any, replica: Int[Array, "rows"]) -> Any:
     """Return numbers by replica as one number per row, and numbers of all replicas as they are."""
     return jax.tree.map(lambda x: x[replica] if jnp.ndim(x) else x, numbers)
@@ -547,7 +609,9 @@ def _of_rows(numbers: Any, replica: Int[Array, "rows"]) -> Any:
 def _with_laws(
     material: ReducedScene, change: Callable[[ReducedContact], ReducedContact]
 ) -> ReducedScene:
-    walls = material.walls and material.walls._replace(law=change(material.walls.law))
+    walls = material.walls
+    if walls is not None:
+        walls = walls._replace(law=change(walls.law))
     return material._replace(law=change(material.law), walls=walls)
 
 
@@ -568,8 +632,8 @@ def _with_surfaces(material: ReducedScene, source: ReducedScene | None = None) -
     """
     walls = material.walls
     if walls is not None:
-        walls = walls._replace(surface=source and source.walls.surface)
-    return material._replace(surface=source and source.surface, walls=walls)
+        walls = walls._replace(surface=None if source is None else source.walls.surface)
+    return material._replace(surface=None if source is None else source.surface, walls=walls)
 
 
 def _material_by_replica(
@@ -582,12 +646,12 @@ def _material_by_replica(
     """
     c = tangents.log_temperature
     one = jnp.ones_like(tangents.elapsed)
-    by_delay = jax.jvp(partial(_faster, material), (one,), (-0.5 * one,))[1]
+    by_log_temperature = jax.jvp(partial(_faster, material), (one,), (-0.5 * one,))[1]
     rows = jax.tree.map(lambda x: jnp.broadcast_to(x, c.shape[1:]), material)
     slopes = jax.tree.map(
         lambda direction, change: direction[:, None] + c * change,
         _with_surfaces(tangents.directions),
-        by_delay,
+        by_log_temperature,
     )
     return rows, slopes
 
