@@ -183,7 +183,7 @@ class HardSpheres(AbstractSpheres):
             scene=scene,
             shape=shape,
             capacity=sizes.capacity,
-            crowded=sizes.equilibration_capacity,
+            equilibration_capacity=sizes.equilibration_capacity,
             listed_by_skin=self.listed_by_skin,
             engine=engine,
             compiled_engine=sizes.engine,
@@ -218,6 +218,6 @@ class HardSpheres(AbstractSpheres):
         chosen = min((0.65 + 0.35 * near) * longest, neighbours.listed)
         expected = neighbours.listed, near, chosen, 1.25 * longest
         extra = 1.3 * max(neighbours.in_contact - 0.4, 0.0)  # random positions have more near pairs
-        capacity, crowded = capacities(expected, neighbours, spare or 1.15, extra, n)
+        capacity, equilibration_capacity = capacities(expected, neighbours, spare or 1.15, extra, n)
         made_for = tuple((k, getattr(self, k)) for k in ("num_particles", "replicas", "neighbours"))
-        return ArraySizes(made_for, share, capacity, crowded, neighbours.engine)
+        return ArraySizes(made_for, share, capacity, equilibration_capacity, neighbours.engine)

@@ -249,7 +249,7 @@ class SoftSpheres(AbstractSpheres):
             scene=scene,
             shape=shape,
             capacity=sizes.capacity,
-            crowded=sizes.equilibration_capacity,
+            equilibration_capacity=sizes.equilibration_capacity,
             listed_by_skin=self.listed_by_skin,
             engine=engine,
             compiled_engine=sizes.engine,
@@ -282,7 +282,7 @@ class SoftSpheres(AbstractSpheres):
         expected = neighbours.listed, near, touching, 2 * touching / (1 + 1.6 * touching**0.6)
         # At random positions the additional touching pairs are about those without correlation.
         extra = 1.3 * neighbours.in_contact
-        capacity, crowded = capacities(expected, neighbours, spare or 1.2, extra, n)
+        capacity, equilibration_capacity = capacities(expected, neighbours, spare or 1.2, extra, n)
         names = "num_particles", "replicas", "neighbours", "steps_per_contact"
         made_for = tuple((name, getattr(self, name)) for name in names)
-        return ArraySizes(made_for, steps, capacity, crowded, neighbours.engine)
+        return ArraySizes(made_for, steps, capacity, equilibration_capacity, neighbours.engine)

@@ -131,7 +131,7 @@ class AbstractSphereDynamics(AbstractDynamics):
         scene: numbers of the gas, in units of its diameter, mass and initial temperature.
         shape: number of boxes, of spheres in each, and dimension d.
         capacity: lengths of the arrays.
-        crowded: lengths of the arrays in the first mean free times of the equilibration.
+        equilibration_capacity: the same in the first mean free times of the equilibration.
         listed_by_skin: pairs per particle that the skin adds to the first neighbour list.
         engine: search for pairs, one of `neighbours.ENGINES` but not "auto".
         compiled_engine: the same in compiled code, as in the random placement.
@@ -139,7 +139,7 @@ class AbstractSphereDynamics(AbstractDynamics):
 
     scene: AbstractVar[SphereScene]
     capacity: AbstractVar[Capacity]
-    crowded: AbstractVar[Capacity]
+    equilibration_capacity: AbstractVar[Capacity]
     listed_by_skin: AbstractVar[float]
     engine: AbstractVar[str]
     compiled_engine: AbstractVar[str]
@@ -203,7 +203,7 @@ class AbstractSphereDynamics(AbstractDynamics):
         """Return the positions and velocities of a fluid, after elastic motion, and the status."""
         frequency = self.scene.collision_frequency
         elastic = self.elastic()
-        crowded = elastic.with_capacity(self.crowded)
+        crowded = elastic.with_capacity(self.equilibration_capacity)
         placed = reach([(self.placement(), 0.0)], each(_begin_placement, self, key))
         state = each(_begin_equilibration, crowded, (placed, key))
         end = jnp.minimum(EQUILIBRATION_COLLISIONS / frequency, MAX_EQUILIBRATION)
@@ -229,7 +229,7 @@ class AbstractSphereDynamics(AbstractDynamics):
             region=self.region,
             skin=self.first_skin,
             shape=self.shape,
-            capacity=self.crowded,
+            capacity=self.equilibration_capacity,
             engine=self.compiled_engine,
         )
 
@@ -399,7 +399,7 @@ def elapsed(old: SphereState, new: SphereState) -> Float[Array, ""]:
 
 def min_duration(state: SphereState) -> Float[Array, ""]:
     """Return the time in which the fastest sphere flies `MIN_FLIGHT`; 0 for spheres at rest."""
-    speed = jnp.sqrt(jnp.max(jnp.sum(state.velocity * state.velocity, -1)))
+    speed = fastest(state.velocity, 1)[0]
     return jnp.where(speed > 0, MIN_FLIGHT / jnp.where(speed > 0, speed, 1.0), 0.0)
 
 

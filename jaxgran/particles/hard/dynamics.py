@@ -96,7 +96,7 @@ class HardDynamics(AbstractSphereDynamics):
     """Hard spheres in windows of time.
 
     Attributes:
-        scene, shape, capacity, crowded, listed_by_skin, engine, compiled_engine: see
+        scene, shape, capacity, equilibration_capacity, listed_by_skin, engine, compiled_engine: see
             `AbstractSphereDynamics`.
         share: impacts per particle in a window.
         contact_time: in mean free times; the impact of a sphere within this time of its last one is
@@ -107,7 +107,7 @@ class HardDynamics(AbstractSphereDynamics):
     scene: SphereScene
     shape: tuple[int, int, int] = eqx.field(static=True)
     capacity: Capacity = eqx.field(static=True)
-    crowded: Capacity = eqx.field(static=True)
+    equilibration_capacity: Capacity = eqx.field(static=True)
     listed_by_skin: float = eqx.field(static=True)
     engine: str = eqx.field(static=True)
     compiled_engine: str = eqx.field(static=True)

@@ -123,8 +123,8 @@ def impact_effect(
             kick = kick + sliding_kick
             lost = lost - share * jnp.sum(sliding_kick * with_half, -1)
             spin_change = added_spin / spin_factor
-            doubled = impact.spin * 2 * share + spin_change
-            rotational_gain = surface.inertia / 2 * jnp.sum(spin_change * doubled, -1)
+            before_and_after = impact.spin * 2 * share + spin_change
+            rotational_gain = surface.inertia / 2 * jnp.sum(spin_change * before_and_after, -1)
     if axis is not None:
         frequency = material.walls.frequency[axis]
         frequency = frequency * wall_impact_ratio(eps, frequency, impact.normal.shape[1])
@@ -190,7 +190,7 @@ class ImpactWork(NamedTuple):
         max_distance2: largest squared distance of each particle, at its impacts, from the place for
             which the neighbour list was built.
         max_speed2: largest squared speed of each particle.
-        pending: whether the last round executed an impact.
+        executed: whether the last round executed an impact.
         num_rounds: number of rounds.
         gains: tangents of the energy gained in impacts of pairs, and of slots on walls if there are
             walls, see `exchange_gains`; without tangents, no changes.
@@ -204,7 +204,7 @@ class ImpactWork(NamedTuple):
     regularised: Int[Array, "slots"]
     max_distance2: Float[Array, "slots"]
     max_speed2: Float[Array, "slots"]
-    pending: Bool[Array, ""]
+    executed: Bool[Array, ""]
     num_rounds: Int[Array, ""]
     gains: Float[Array, "changes energies rows"]
 
@@ -344,21 +344,21 @@ def execute_impacts(
             regularised=regularised,
             max_distance2=jnp.maximum(work.max_distance2, jnp.where(hit, distance2, 0.0)),
             max_speed2=jnp.maximum(work.max_speed2, jnp.sum(v * v, -1)),
-            pending=jnp.any(hit),
+            executed=jnp.any(hit),
             num_rounds=work.num_rounds + 1,
             gains=gains,
         )
 
     def unfinished(work: ImpactWork):
-        return work.pending & (work.num_rounds < MAX_ROUNDS)
+        return work.executed & (work.num_rounds < MAX_ROUNDS)
 
     counts = jnp.zeros_like(slots)
     zeros = jnp.zeros(len(slots), paths.x.dtype)
     shape = 0, 1, num_rows
     if tangents is not None:
         num_directions, num_energies, _ = tangents.energies.shape
-        num_walls = 0 if scene.container is None else len(slots)
-        shape = num_directions + num_energies, num_energies, num_rows + num_walls
+        num_wall_rows = 0 if scene.container is None else len(slots)
+        shape = num_directions + num_energies, num_energies, num_rows + num_wall_rows
     work = ImpactWork(
         paths=paths,
         dissipated=zeros,
@@ -368,7 +368,7 @@ def execute_impacts(
         regularised=counts,
         max_distance2=zeros,
         max_speed2=zeros,
-        pending=jnp.array(True),
+        executed=jnp.array(True),
         num_rounds=jnp.int32(0),
         gains=jnp.zeros(shape, zeros.dtype),
     )

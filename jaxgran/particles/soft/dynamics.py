@@ -153,7 +153,7 @@ class SoftDynamics(AbstractSphereDynamics):
     """Viscoelastic spheres in blocks of equal time steps.
 
     Attributes:
-        scene, shape, capacity, crowded, listed_by_skin, engine, compiled_engine: see
+        scene, shape, capacity, equilibration_capacity, listed_by_skin, engine, compiled_engine: see
             `AbstractSphereDynamics`.
         steps_per_contact: steps in the mean contact duration at the current temperature.
         steps_per_block: steps for which the candidates for contact are fixed.
@@ -163,7 +163,7 @@ class SoftDynamics(AbstractSphereDynamics):
     scene: SphereScene
     shape: tuple[int, int, int] = eqx.field(static=True)
     capacity: Capacity = eqx.field(static=True)
-    crowded: Capacity = eqx.field(static=True)
+    equilibration_capacity: Capacity = eqx.field(static=True)
     listed_by_skin: float = eqx.field(static=True)
     engine: str = eqx.field(static=True)
     compiled_engine: str = eqx.field(static=True)
