@@ -18,7 +18,13 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxgran.gradients.tangents import ExchangeTangents
 from jaxgran.particles.elements import drag_decay, tangential_impulse
-from jaxgran.particles.hard.prediction import ImpactCandidates, Paths, first_impacts
+from jaxgran.particles.hard.prediction import (
+    FirstImpacts,
+    ImpactCandidates,
+    PairRows,
+    Paths,
+    first_impacts,
+)
 from jaxgran.particles.spheres import SphereState, temperature
 from jaxgran.scene.elements import wall_impact_ratio
 from jaxgran.scene.gas import ReducedScene, SphereScene
@@ -173,6 +179,110 @@ def exchange_gains(
     return jax.vmap(linear)(jax.tree.map(padded, tangents.directions), scales.astype(none.dtype))
 
 
+class SlotImpacts(NamedTuple):
+    """The impact of each particle in one round; particles without one have a time and a kick of 0.
+
+    Attributes:
+        happens: whether it has one.
+        time: its time.
+        x: position of the path after it, extrapolated back to the start of the window.
+        effect: on the particle.
+        too_soon: whether it follows the last one too soon.
+    """
+
+    happens: Bool[Array, "slots"]
+    time: Float[Array, "slots"]
+    x: Float[Array, "slots d"]
+    effect: ImpactEffect
+    too_soon: Bool[Array, "slots"]
+
+
+class ImpactRules(NamedTuple):
+    """What decides the effect of impacts in a window.
+
+    Attributes:
+        scene: the gas, with one law for all rows or one for each.
+        tangents: at the beginning of the window; None without them.
+        start_time: of the window.
+        contact_duration: of each particle; an impact within this time of the last one is elastic.
+        all_elastic: whether all impacts are elastic and smooth.
+        rows: the pairs that may touch.
+    """
+
+    scene: SphereScene
+    tangents: ExchangeTangents | None
+    start_time: Float[Array, ""]
+    contact_duration: Float[Array, "slots"]
+    all_elastic: Bool[Array, ""]
+    rows: PairRows
+
+    def pair_impacts(
+        self, paths: Paths, upcoming: FirstImpacts
+    ) -> tuple[SlotImpacts, Bool[Array, "slots"], Array | None]:
+        """Return the impacts of pairs, which particles no pair may hit, and gains of the pairs."""
+        a = self.rows.a
+        b = self.rows.b
+        num_rows = len(a)
+        index = jnp.arange(num_rows, dtype=jnp.int32)
+        slots = jnp.arange(len(paths.x), dtype=jnp.int32)
+        times = upcoming.times
+        executable = jnp.isfinite(times)
+        for k in (a, b):
+            executable &= (times == upcoming.first[k]) & (times == upcoming.final[k])
+        # Of several impacts at exactly the same time, a sphere takes the one in the first row.
+        rank = jnp.where(executable, index, num_rows)
+        row = jnp.full(len(slots), num_rows, jnp.int32).at[a].min(rank).at[b].min(rank)
+        executable &= (row[a] == index) & (row[b] == index)
+
+        s = jnp.where(executable, times, 0.0)
+        r = upcoming.r + upcoming.w * s[:, None]
+        normal = r / jnp.where(executable, jnp.sqrt(jnp.sum(r * r, -1)), 1.0)[:, None]
+        speed = jnp.where(executable, -jnp.sum(upcoming.w * normal, -1), 1.0)
+        too_soon = s - jnp.maximum(paths.last[a], paths.last[b]) < self.contact_duration[a]
+        spin = None if paths.spin is None else paths.spin[a] + paths.spin[b]
+        elastic = too_soon | self.all_elastic | ~executable
+        events = ImpactEvents(self.start_time + s, -normal, upcoming.w, speed, spin, elastic)
+        effect = impact_effect(self.scene, events)
+        gains = None
+        if self.tangents is not None:  # each of two loses half of the energy
+            gains = 2 * exchange_gains(self.scene, self.tangents, events, executable)
+
+        # From the rows of pairs to the slots of their spheres.
+        row_or_last = jnp.minimum(row, num_rows - 1)
+        is_first = a[row_or_last] == slots
+        happens = executable[row_or_last] & (is_first | (b[row_or_last] == slots))
+        sign = jnp.where(happens, jnp.where(is_first, 1.0, -1.0), 0.0)
+        effect = jax.tree.map(lambda x: x[row_or_last], effect)
+        effect = effect._replace(kick=sign[:, None] * effect.kick)
+        time = jnp.where(happens, s[row_or_last], 0.0)
+        x = paths.x - effect.kick * time[:, None]
+        impacts = SlotImpacts(happens, time, x, effect, too_soon[row_or_last])
+        return impacts, row == num_rows, gains
+
+    def wall_impacts(
+        self, paths: Paths, upcoming: FirstImpacts, unpaired: Bool[Array, "slots"]
+    ) -> tuple[SlotImpacts, Array | None]:
+        """Return the impacts on walls of particles that no pair may hit, and their gains."""
+        times = upcoming.wall_times
+        axis = upcoming.wall_axis
+        assert times is not None and axis is not None
+        happens = unpaired & jnp.isfinite(times)
+        happens &= (times == upcoming.first) & (times == upcoming.final)
+        s = jnp.where(happens, times, 0.0)
+        too_soon = s - paths.last < self.contact_duration
+        is_axis = axis[:, None] == jnp.arange(paths.v.shape[1])[None]
+        outwards = jnp.where(is_axis, jnp.sign(paths.v), 0.0)
+        speed = jnp.where(happens, jnp.sum(paths.v * outwards, axis=1), 1.0)
+        elastic = too_soon | self.all_elastic | ~happens
+        events = ImpactEvents(self.start_time + s, outwards, paths.v, speed, paths.spin, elastic)
+        effect = impact_effect(self.scene, events, axis)
+        gains = None
+        if self.tangents is not None:
+            gains = exchange_gains(self.scene, self.tangents, events, happens, axis)
+        x = paths.x + paths.v * s[:, None] - (paths.v + effect.kick) * s[:, None]
+        return SlotImpacts(happens, s, x, effect, too_soon), gains
+
+
 MAX_ROUNDS = 100_000
 """Rounds of independent impacts in one window at which the run counts as stalled."""
 
@@ -250,114 +360,63 @@ def execute_impacts(
     contact_duration = contact_time / (scene.collision_frequency * jnp.sqrt(T))
     contact_duration = contact_duration[jnp.minimum(candidates.replica, replicas - 1)]
     rows = candidates.rows
-    slots = jnp.arange(len(v), dtype=jnp.int32)
-    a = rows.a
-    b = rows.b
-    num_rows = len(rows.a)
     law = scene.material.law
     if isinstance(law, LawOfReplicas):
-        law = law.of_rows(candidates.replica[a])
+        law = law.of_rows(candidates.replica[rows.a])
         scene = scene._replace(material=scene.material._replace(law=law))
-    index = jnp.arange(num_rows, dtype=jnp.int32)
+    rules = ImpactRules(scene, tangents, start_time, contact_duration, all_elastic, rows)
 
     def one_round(work: ImpactWork) -> ImpactWork:
         paths = work.paths
-        next_impacts = first_impacts(paths, rows, duration, scene.container)
-        times = next_impacts.times
-        first = next_impacts.first
-        final = next_impacts.final
-        executable = jnp.isfinite(times)
-        for k in (a, b):
-            executable &= (times == first[k]) & (times == final[k])
-        # Of several impacts at exactly the same time, a sphere takes the one in the first row.
-        rank = jnp.where(executable, index, num_rows)
-        row = jnp.full(len(slots), num_rows, jnp.int32).at[a].min(rank).at[b].min(rank)
-        executable &= (row[a] == index) & (row[b] == index)
-
-        s = jnp.where(executable, times, 0.0)
-        r = next_impacts.r + next_impacts.w * s[:, None]
-        normal = r / jnp.where(executable, jnp.sqrt(jnp.sum(r * r, -1)), 1.0)[:, None]
-        speed = jnp.where(executable, -jnp.sum(next_impacts.w * normal, -1), 1.0)
-        too_soon = s - jnp.maximum(paths.last[a], paths.last[b]) < contact_duration[a]
-        spin = None if paths.spin is None else paths.spin[a] + paths.spin[b]
-        elastic = too_soon | all_elastic | ~executable
-        events = ImpactEvents(start_time + s, -normal, next_impacts.w, speed, spin, elastic)
-        effect = impact_effect(scene, events)
-        gains = work.gains
-        if tangents is not None:  # each of two loses half of the energy
-            more = 2 * exchange_gains(scene, tangents, events, executable)
-            gains = gains.at[..., :num_rows].add(more)
-
-        # From the rows of pairs to the slots of their spheres.
-        unpaired = row == num_rows
-        row = jnp.minimum(row, num_rows - 1)
-        hit = executable[row] & ((a[row] == slots) | (b[row] == slots))
-        sign = jnp.where(hit, jnp.where(a[row] == slots, 1.0, -1.0), 0.0)
-        effect = jax.tree.map(lambda x: x[row], effect)
-        effect = effect._replace(kick=sign[:, None] * effect.kick)
-        s = jnp.where(hit, s[row], 0.0)
-        too_soon = too_soon[row]
-        x = paths.x - effect.kick * s[:, None]
-        impacts = work.impacts + hit.astype(jnp.int32)
+        upcoming = first_impacts(paths, rows, duration, scene.container)
+        of_pairs, unpaired, gains = rules.pair_impacts(paths, upcoming)
+        happening = of_pairs
         wall_impacts = work.wall_impacts
-        regularised = work.regularised + (hit & too_soon).astype(jnp.int32)
-        wall_times = next_impacts.wall_times
-        axis = next_impacts.wall_axis
-        if wall_times is not None and axis is not None and wall_impacts is not None:
-            at_wall = unpaired & jnp.isfinite(wall_times)
-            at_wall &= (wall_times == first) & (wall_times == final)
-            wall_s = jnp.where(at_wall, wall_times, 0.0)
-            too_soon = wall_s - paths.last < contact_duration
-            is_axis = axis[:, None] == jnp.arange(paths.v.shape[1])[None]
-            outwards = jnp.where(is_axis, jnp.sign(paths.v), 0.0)
-            speed = jnp.where(at_wall, jnp.sum(paths.v * outwards, axis=1), 1.0)
-            elastic = too_soon | all_elastic | ~at_wall
-            events = ImpactEvents(
-                start_time + wall_s, outwards, paths.v, speed, paths.spin, elastic
-            )
-            on_wall = impact_effect(scene, events, axis)
-            if tangents is not None:
-                more = exchange_gains(scene, tangents, events, at_wall, axis)
-                gains = gains.at[..., num_rows:].add(more)
-            effect = jax.tree.map(partial(_where_rows, at_wall), on_wall, effect)
-            s = jnp.where(at_wall, wall_s, s)
-            hit = hit | at_wall
-            after = paths.x + paths.v * s[:, None] - (paths.v + effect.kick) * s[:, None]
-            x = _where_rows(at_wall, after, x)
-            wall_impacts = wall_impacts + at_wall.astype(jnp.int32)
+        regularised = work.regularised + (of_pairs.happens & of_pairs.too_soon).astype(jnp.int32)
+        if wall_impacts is not None:
+            at_walls, wall_gains = rules.wall_impacts(paths, upcoming, unpaired)
+            happening = jax.tree.map(partial(_where_rows, at_walls.happens), at_walls, of_pairs)
+            wall_impacts = wall_impacts + at_walls.happens.astype(jnp.int32)
             # An impact of two spheres counts twice.
-            regularised = regularised + 2 * (at_wall & too_soon).astype(jnp.int32)
-
+            too_soon = at_walls.happens & at_walls.too_soon
+            regularised = regularised + 2 * too_soon.astype(jnp.int32)
+            if gains is not None and wall_gains is not None:
+                gains = jnp.concatenate([gains, wall_gains], axis=-1)
+        hit = happening.happens
+        s = happening.time
+        effect = happening.effect
         v = paths.v + effect.kick
         spin = paths.spin
         rotational_gain = work.rotational_gain
-        if spin is not None and rotational_gain is not None:
+        if spin is not None and rotational_gain is not None and effect.rotational_gain is not None:
             spin = spin + _where_rows(hit, effect.spin_change, jnp.zeros_like(spin))
             rotational_gain = rotational_gain + jnp.where(hit, effect.rotational_gain, 0.0)
         distance2 = jnp.sum((paths.x + paths.v * s[:, None] - listed) ** 2, -1)
         return ImpactWork(
-            paths=Paths(x, v, jnp.where(hit, s, paths.last), spin),
+            paths=Paths(happening.x, v, jnp.where(hit, s, paths.last), spin),
             dissipated=work.dissipated + jnp.where(hit, effect.lost, 0.0),
             rotational_gain=rotational_gain,
-            impacts=impacts,
+            impacts=work.impacts + of_pairs.happens.astype(jnp.int32),
             wall_impacts=wall_impacts,
             regularised=regularised,
             max_distance2=jnp.maximum(work.max_distance2, jnp.where(hit, distance2, 0.0)),
             max_speed2=jnp.maximum(work.max_speed2, jnp.sum(v * v, -1)),
             executed=jnp.any(hit),
             num_rounds=work.num_rounds + 1,
-            gains=gains,
+            gains=work.gains if gains is None else work.gains + gains,
         )
 
     def unfinished(work: ImpactWork):
         return work.executed & (work.num_rounds < MAX_ROUNDS)
 
-    counts = jnp.zeros_like(slots)
-    zeros = jnp.zeros(len(slots), paths.x.dtype)
+    num_slots = len(x)
+    num_rows = len(rows.a)
+    counts = jnp.zeros(num_slots, jnp.int32)
+    zeros = jnp.zeros(num_slots, paths.x.dtype)
     shape = 0, 1, num_rows
     if tangents is not None:
         num_directions, num_energies, _ = tangents.energies.shape
-        num_wall_rows = 0 if scene.container is None else len(slots)
+        num_wall_rows = 0 if scene.container is None else num_slots
         shape = num_directions + num_energies, num_energies, num_rows + num_wall_rows
     work = ImpactWork(
         paths=paths,
