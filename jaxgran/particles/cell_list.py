@@ -52,14 +52,14 @@ class CellGrid(NamedTuple):
     Attributes:
         around: cells around the box along an axis across the rows; 1 if only one fits.
         around_row: cells around the box along a row.
-        reach: cells of a row within the cutoff; 0 if the box is one cell.
+        cells_in_reach: cells of a row within the cutoff; 0 if the box is one cell.
         occupied: numbers of cells along each axis between the first and the last particle. Cells
             beyond them are empty, and have no place in arrays.
     """
 
     around: Int[Array, ""]
     around_row: Int[Array, ""]
-    reach: Int[Array, ""]
+    cells_in_reach: Int[Array, ""]
     occupied: Int[Array, "d"]
 
 
@@ -81,8 +81,9 @@ def reach_in_steps(
     cutoff: ArrayLike, side: ArrayLike, position: Float[Array, "..."]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the cutoff in `STEPS`, enlarged by rounding errors, and its square in float32."""
-    reach = jnp.asarray(cutoff / side) * STEPS + 8 + 4 * STEPS * jnp.finfo(position.dtype).eps
-    return reach, (reach * reach * (1 + 1e-6)).astype(jnp.float32)
+    reach_steps = jnp.asarray(cutoff / side) * STEPS
+    reach_steps = reach_steps + 8 + 4 * STEPS * jnp.finfo(position.dtype).eps
+    return reach_steps, (reach_steps * reach_steps * (1 + 1e-6)).astype(jnp.float32)
 
 
 def num_words_ahead(engine: str, ahead: int, num_particles: int, num_runs: int) -> int:
@@ -161,42 +162,21 @@ def cells(
     n = total // replicas
     num_runs = (3 ** (dimension - 1) + 1) // 2
     num_words = num_words_ahead("cells", min(ahead, n), total, num_runs)
-    reach, square = reach_in_steps(cutoff, side, position)
+    reach_steps, square = reach_in_steps(cutoff, side, position)
     finite = jnp.all(jnp.isfinite(position))
-    unit = jnp.where(finite, position / side, 0.0).T
-    unit = jnp.where(unit >= 1, 0.0, unit)  # by rounding
-
-    lowest = jnp.min(unit, axis=1)
-    extent = jnp.max(unit, axis=1) - lowest
-    axes = jnp.argsort(extent)
-    unit = unit[axes]
-    lowest = lowest[axes]
+    unit, lowest, extent = _along_axes(jnp.where(finite, position / side, 0.0))
     max_cells = max(n // MIN_PER_CELL, 1)
-    grid = _cell_grid(extent[axes], reach / STEPS, max_cells)
-    place = _places(unit, lowest, grid)
-    row = jnp.repeat(jnp.arange(replicas, dtype=jnp.int32), n)
-    for axis in range(dimension - 1):
-        row = row * grid.occupied[axis] + place[axis]
-    cell, order = _sort_by_cell(row * grid.occupied[-1] + place[-1])
+    grid = _cell_grid(extent, reach_steps / STEPS, max_cells)
+    cell, order = _sort_by_cell(_cells_of_particles(unit, lowest, grid, replicas))
     rows = _rows(cell, grid, max_cells, replicas, dimension)
-
-    # The slots of the particles and of their images.
     row = jax.lax.div(cell, grid.occupied[-1])
     place_in_row = cell - row * grid.occupied[-1]
-    slot = jnp.arange(total, dtype=jnp.int32) + take(rows.shift, row)
-    num_slots = 2 * total + WORD  # each particle has at most one image
-    at_begin = place_in_row < grid.reach
-    at_end = place_in_row >= grid.around_row - grid.reach
-    turns = at_begin.astype(jnp.int32) - at_end.astype(jnp.int32)
-    image = jnp.where(turns == 0, num_slots, slot + turns * take(rows.length, row))
-    particle = jnp.zeros(num_slots, jnp.int32).at[slot].set(order)
-    particle = particle.at[image].set(order, mode="drop")
-
+    slot, particle = _slots(grid, rows, row, place_in_row, order)
+    firsts, counts = _runs(grid, rows, row, place_in_row, slot)
+    longest = jnp.where(finite, jnp.max(jnp.stack(counts)), 0)
     steps = [((x - 0.5) * STEPS).astype(jnp.int32) for x in unit]
     here = [take(x, order) for x in steps]
     there = [take(x, particle) for x in steps]
-    firsts, counts = _runs(grid, rows, row, place_in_row, slot)
-    longest = jnp.where(finite, jnp.max(jnp.stack(counts)), 0)
 
     def compare_block(carry: tuple) -> tuple:
         block, words = carry
@@ -224,12 +204,27 @@ def cells(
     return i, j, count, longest
 
 
-def _cell_grid(extent: Float[Array, "d"], reach: ArrayLike, max_cells: int) -> CellGrid:
+def _along_axes(
+    unit: Float[Array, "n d"],
+) -> tuple[Float[Array, "d n"], Float[Array, "d"], Float[Array, "d"]]:
+    """Return coordinates over the side along each axis, with their minima and extents.
+
+    The axis along which the particles extend farthest is the last one.
+    """
+    unit = unit.T
+    unit = jnp.where(unit >= 1, 0.0, unit)  # by rounding
+    lowest = jnp.min(unit, axis=1)
+    extent = jnp.max(unit, axis=1) - lowest
+    axes = jnp.argsort(extent)
+    return unit[axes], lowest[axes], extent[axes]
+
+
+def _cell_grid(extent: Float[Array, "d"], cutoff: ArrayLike, max_cells: int) -> CellGrid:
     """Return the cells of a box, of at least the cutoff, at most `max_cells` before refinement.
 
     Args:
         extent: distance of the last from the first particle along each axis, over the side.
-        reach: cutoff over the side.
+        cutoff: over the side.
         max_cells: largest number of cells, of which rows have `CELLS_WITHIN_CUTOFF` times as many.
     """
 
@@ -239,26 +234,27 @@ def _cell_grid(extent: Float[Array, "d"], reach: ArrayLike, max_cells: int) -> C
     def too_many(around: Int[Array, ""]) -> Bool[Array, ""]:
         return jnp.prod(occupied(around).astype(extent.dtype)) > max_cells
 
-    around = jnp.clip((1 - EDGE_MARGIN) / reach, 1, MAX_AROUND).astype(jnp.int32)
+    around = jnp.clip((1 - EDGE_MARGIN) / cutoff, 1, MAX_AROUND).astype(jnp.int32)
     around = jax.lax.while_loop(too_many, lambda around: around - around // 10 - 1, around)
     one_cell = around < MIN_AROUND
     around = jnp.where(one_cell, 1, around)
     around_row = jnp.where(one_cell, 1, CELLS_WITHIN_CUTOFF * around)
-    reach_in_cells = jnp.where(one_cell, 0, CELLS_WITHIN_CUTOFF)
+    cells_in_reach = jnp.where(one_cell, 0, CELLS_WITHIN_CUTOFF).astype(jnp.int32)
     along_axis = jnp.full(len(extent), around).at[-1].set(around_row)
-    return CellGrid(around, around_row, reach_in_cells.astype(jnp.int32), occupied(along_axis))
+    return CellGrid(around, around_row, cells_in_reach, occupied(along_axis))
 
 
-def _places(
-    unit: Float[Array, "d n"], lowest: Float[Array, "d"], grid: CellGrid
-) -> list[Int[Array, "n"]]:
-    """Return the index of the cell of each particle along each axis."""
+def _cells_of_particles(
+    unit: Float[Array, "d n"], lowest: Float[Array, "d"], grid: CellGrid, replicas: int
+) -> Int[Array, "n"]:
+    """Return the index of the cell of each particle, of the cells of all boxes."""
     around = [*[grid.around] * (len(unit) - 1), grid.around_row]
-    axes = zip(unit, lowest, around, grid.occupied, strict=True)
-    return [
-        jnp.clip(((x - low) * number).astype(jnp.int32), 0, occupied - 1)
-        for x, low, number, occupied in axes
-    ]
+    n = unit.shape[1] // replicas
+    cell = jnp.repeat(jnp.arange(replicas, dtype=jnp.int32), n)
+    for x, low, number, occupied in zip(unit, lowest, around, grid.occupied, strict=True):
+        place = jnp.clip(((x - low) * number).astype(jnp.int32), 0, occupied - 1)
+        cell = cell * occupied + place
+    return cell
 
 
 def _sort_by_cell(cell: Int[Array, "n"]) -> tuple[Int[Array, "n"], Int[Array, "n"]]:
@@ -291,10 +287,37 @@ def _rows(
 
     begin = start_of(jnp.zeros((), jnp.int32))
     end = start_of(along_row)
-    images_before = end - start_of(grid.around_row - grid.reach)
-    images_after = start_of(grid.reach) - begin
+    images_before = end - start_of(grid.around_row - grid.cells_in_reach)
+    images_after = start_of(grid.cells_in_reach) - begin
     images = jnp.cumsum(images_before + images_after, dtype=jnp.int32)
     return Rows(start, end - begin, images - images_after)
+
+
+def _slots(
+    grid: CellGrid,
+    rows: Rows,
+    row: Int[Array, "n"],
+    place: Int[Array, "n"],
+    order: Int[Array, "n"],
+) -> tuple[Int[Array, "n"], Int[Array, "slots"]]:
+    """Return the slot of each sorted particle, and the particle in each slot, with images.
+
+    Args:
+        grid: the cells.
+        rows: the rows of cells.
+        row: row of each sorted particle.
+        place: cell of each sorted particle in its row.
+        order: the sorted particles.
+    """
+    n = len(order)
+    slot = jnp.arange(n, dtype=jnp.int32) + take(rows.shift, row)
+    num_slots = 2 * n + WORD  # each particle has at most one image
+    at_begin = place < grid.cells_in_reach
+    at_end = place >= grid.around_row - grid.cells_in_reach
+    turns = at_begin.astype(jnp.int32) - at_end.astype(jnp.int32)
+    image = jnp.where(turns == 0, num_slots, slot + turns * take(rows.length, row))
+    particle = jnp.zeros(num_slots, jnp.int32).at[slot].set(order)
+    return slot, particle.at[image].set(order, mode="drop")
 
 
 def _runs(
@@ -327,7 +350,7 @@ def _runs(
         return start + take(rows.shift, row) + turns * take(rows.length, row)
 
     firsts = [slot + 1]
-    counts = [slot_of(row, place + grid.reach + 1) - slot - 1]
+    counts = [slot_of(row, place + grid.cells_in_reach + 1) - slot - 1]
     *across, _ = grid.occupied
     places = []
     box = row
@@ -339,17 +362,17 @@ def _runs(
         if step <= (0,) * len(across):
             continue
         other = box
-        occupied = grid.reach > 0
+        exists = grid.cells_in_reach > 0
         for x, by, number in zip(places, step, across, strict=True):
             neighbour = x + by
             neighbour = jnp.where(neighbour < 0, neighbour + grid.around, neighbour)
             neighbour = jnp.where(neighbour >= grid.around, neighbour - grid.around, neighbour)
-            occupied = occupied & (neighbour < number)
+            exists = exists & (neighbour < number)
             other = other * number + neighbour
-        other = jnp.where(occupied, other, 0)
-        first = slot_of(other, place - grid.reach)
+        other = jnp.where(exists, other, 0)
+        first = slot_of(other, place - grid.cells_in_reach)
         firsts.append(first)
-        counts.append(jnp.where(occupied, slot_of(other, place + grid.reach + 1) - first, 0))
+        counts.append(jnp.where(exists, slot_of(other, place + grid.cells_in_reach + 1) - first, 0))
     return firsts, counts
 
 

@@ -130,9 +130,9 @@ def sweep(
         return jax.lax.dynamic_slice_in_dim(ahead_of[axis], first, count, axis=1)
 
     # The cutoff in steps of y and z, and along x in steps of x, enlarged by the rounding errors.
-    reach, square = reach_in_steps(cutoff, side, position)
+    reach_steps, square = reach_in_steps(cutoff, side, position)
     square = jnp.minimum(square, (STEPS / 2) ** 2)  # beyond, pairs would occur twice
-    along_x = (reach * (_X_STEPS / STEPS)).astype(jnp.int32) + 2 ** max(bits - 1, 1)
+    along_x = (reach_steps * (_X_STEPS / STEPS)).astype(jnp.int32) + 2 ** max(bits - 1, 1)
     finite = jnp.all(jnp.isfinite(position))
 
     def compare_block(carry):
