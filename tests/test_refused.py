@@ -128,6 +128,7 @@ def fit(measurement=None, **options):
     return jaxgran.fit(measurement, progress=False, **options)
 
 
+HOT_SPINS = jaxgran.Rough(0.5, rotational_temperature=1e6)
 STICKY = jaxgran.Rough(0.5, friction=0.0)
 HAFF = {"model": HaffLaw(), "free": ("coefficient",)}
 """A fit of `GRAINS` that compiles in no time."""
@@ -158,7 +159,7 @@ SCENES = [
     ),
     (lambda: cool(between_walls().replace(wall_side=1.25 * GAS.diameter)), r"must lie in \(2.1"),
     (
-        lambda: cool(gas_with(surface=jaxgran.Rough(0.5, rotational_temperature=1e6))),
+        lambda: cool(dataclasses.replace(GAS, surface=HOT_SPINS)),
         "overlap by .* to which the gas heats up",
     ),
     (lambda: GRAINS.delta, "delta belongs to the Viscoelastic law"),
@@ -440,6 +441,17 @@ FITS = [
         "temperature .*given start",
     ),
     # several measurements
+    (
+        {
+            "measurement": {
+                "a": measured(priors={"dissipative_constant": (1e-6, 1e-8)}),
+                "b": measured(LATER),
+            },
+            "free": "youngs_modulus",
+            "separate": (A,),
+        },
+        "dissipative_constant is fitted separately for each curve",
+    ),
     ({"measurement": TWO, "free": A, "separate": (A,)}, "different names"),
     ({"measurement": TWO, "model": jaxgran.DSMC(10)}, "a model without noise"),
     ({"measurement": DISAGREE}, "different values .*5e.07 .* and 6e.07"),

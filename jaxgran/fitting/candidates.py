@@ -15,7 +15,7 @@ from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.header import ABSENT
-from jaxgran.data.measurement import Measurement
+from jaxgran.data.measurement import START_TIME, Measurement
 from jaxgran.scene.elements import Rough
 
 CURVE = "curve"
@@ -156,14 +156,20 @@ def with_rotation(measurement: Measurement) -> Measurement | None:
 def with_duration(measurement: Measurement, factor: float) -> Measurement:
     """Return a measurement whose last time is later; as many times lie between the ends.
 
-    The logarithms of the times after 0 keep their relative distances.
+    The logarithms of the times since the start keep their relative distances.
     """
-    times = np.array(measurement.curve.times)
+    t0 = _start_time(measurement)
+    times = np.array(measurement.curve.times) - t0
     after = times > 0
     logs = np.log(times[after])
     share = (logs - logs[0]) / (logs[-1] - logs[0])
     times[after] *= factor**share
-    return with_curve(measurement, times=times)
+    return with_curve(measurement, times=times + t0)
+
+
+def _start_time(measurement: Measurement) -> float:
+    """Return the time at which a gas begins to cool, s, as it is known."""
+    return float(measurement.priors.get(START_TIME, (0.0, 0.0))[0])
 
 
 def with_more_points(measurement: Measurement) -> Measurement | None:
@@ -224,7 +230,8 @@ def with_second_density(measurement: Measurement) -> dict[str, Measurement]:
     N = measurement.num_particles
     if gas.container is not None and N is not None:
         second = dataclasses.replace(second, num_particles=max(round(ratio * N), 1))
-    times = np.asarray(measurement.curve.times) / ratio  # as many collisions
+    t0 = _start_time(measurement)
+    times = t0 + (np.asarray(measurement.curve.times) - t0) / ratio  # as many collisions
     return {CURVE: measurement, "second density": with_curve(second, times=times)}
 
 

@@ -64,8 +64,8 @@ class Comparison:
 
     Attributes:
         curve: the predicted curve, with the measurement.
-        sources: factors of the variances by "measurement", "few particles", "model" and
-            "simulation"; 1 by default.
+        sources: factors of the variances by "measurement", "few particles", "sampling",
+            "model" and "simulation"; 1 by default.
     """
 
     curve: PredictedCurve
@@ -194,7 +194,8 @@ class Comparison:
         of_number = few_particles * np.exp(log_scatter)
         white = float(curve.values.get(WHITE, 0.0))
         factor = self.sources.get("model", 1.0) ** 0.5
-        return curve.rows.noise(curve.times, of_number, white, factor)
+        noise = curve.rows.noise(curve.times, of_number, white, factor)
+        return noise._replace(sample=self.sources.get("sampling", 1.0) * noise.sample)
 
 
 def _nodes(curve: PredictedCurve, batch: Prediction, gas: Gas) -> Nodes:

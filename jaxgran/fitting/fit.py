@@ -154,6 +154,13 @@ def fit(
             width = START_TIME_PRIOR * float(halving_time(curves[label or first].curve))
             start_time = {START_TIME: (jnp.asarray(0.0), jnp.asarray(width))}
             priors[label] = priors.get(label, {}) | start_time
+    if both := [name for name in separate if name in priors.get(SHARED, {})]:
+        raise ValueError(
+            f"{both[0]} is fitted separately for each curve, and the curves have one common prior "
+            "of it: free it for all, or leave its error out of the headers"
+        )
+    if model.stochastic:  # of one curve, whose parameters are all its own
+        names, separate = (*names, *separate), ()
     descent = None if solver is None else Descent(solver, progress, throw)
     declared = [m.absent for m in curves.values()] or [()]
     request = Request(

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 from tqdm import tqdm
@@ -13,7 +14,7 @@ from jaxgran._utils.formatting import text_table
 from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran._utils.validation import check_bool, checked_int
 from jaxgran.data.curve import CoolingCurve
-from jaxgran.data.measurement import Measurement
+from jaxgran.data.measurement import START_TIME, Measurement
 from jaxgran.fitting.fit import fit
 from jaxgran.fitting.result import CONDITIONAL, Fit
 from jaxgran.fitting.twins import AS_GIVEN, Truth, strongest_effect
@@ -190,7 +191,10 @@ def _checked(result: Any, runs: int) -> Measurement:
             f"{MAX_GRAINS:.2g} are allowed: ask for {fewer} runs or fewer"
         )
     curve = replace(measurement.curve, displacement=None, displacement_error=None)
-    return replace(measurement, gas=result.gas, data=curve, rounding={})
+    priors = dict(measurement.priors)
+    if START_TIME in priors:
+        priors[START_TIME] = jnp.asarray(result.start_time[""]), priors[START_TIME][1]
+    return replace(measurement, gas=result.gas, data=curve, rounding={}, priors=priors)
 
 
 def _imitated(
@@ -214,7 +218,13 @@ def _imitated(
         model = choose_model(gas, times, TOLERANCE, N, models=models).model
     several: Any = replace(model, replicas=runs * measurement.replicas)
     of_start, of_errors = jax.random.split(key)
-    curve = cool(gas, times, model=several, key=of_start, progress=progress)
+    since = times - jnp.asarray(result.start_time[""])
+    if since[0] < 0:
+        raise ValueError(
+            f"the gas of this fit began at t0 = {result.start_time['']:g} s, after the first time: "
+            "imitations begin with the gas. Leave the earlier rows out"
+        )
+    curve = cool(gas, since, model=several, key=of_start, progress=progress)
     twins = _measured(measurement, result, curve, runs, of_errors)
     without = {"softness", "correlations"} if isinstance(model, DSMC) else {"softness"}
     theory = KineticTheory(corrections=KineticTheory.all_corrections - without)

@@ -24,6 +24,9 @@ MIN_EIGENVALUE = 1e-12
 FEW_PARTICLES = "few particles"
 """Part of an error by the randomness of collisions of N grains."""
 
+SAMPLING = "sampling"
+"""Part of an error by T of some tracked grains in place of all."""
+
 
 def inverse(information: np.ndarray) -> np.ndarray:
     """Return the covariance of parameters of some information; very large where there is none."""
@@ -50,6 +53,8 @@ def information_by_source(
         )
 
     sources = ["measurement", FEW_PARTICLES, "model"]
+    if any(m.grains.sample > 0 for m in problem.curves):
+        sources.append(SAMPLING)
     if any(np.any(np.asarray(m.simulation) > 0) for m in problem.curves):
         sources.append("simulation")
     for name in sources if problem.curves else []:

@@ -12,7 +12,13 @@ from jaxgran._utils.validation import float_array
 from jaxgran.data.curve import NOISE
 from jaxgran.data.measurement import Measurement
 from jaxgran.fitting.prediction import TINY, times_with_nodes
-from jaxgran.fitting.rows import CurveRows, Displacement, Grains
+from jaxgran.fitting.rows import (
+    BEYOND_ROUNDING,
+    CurveRows,
+    Displacement,
+    Grains,
+    rounding_errors,
+)
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.choose import error_model_of_curve
 from jaxgran.models.kinetic_theory import KineticTheory
@@ -58,7 +64,7 @@ def curve_rows(
         gas=with_neutral_elements(gas, model),
         values=values,
         errors=errors,
-        used=_used(measurement, values, fits_T_0),
+        used=_used(measurement, values, errors, fits_T_0),
         grains=_grains(measurement, fits_T_0),
         faster=_finite_size_factor(measurement),
         unit_time=float(scales_at(gas).mean_free_time),
@@ -96,26 +102,26 @@ def _errors(
     of_rotation = _errors_of_measurement(
         "T_rot_err", measurement, given, values[:, 1], spins, notes
     )
-    digits = measurement.rounding
-    of_T = np.hypot(of_T, np.asarray(digits.get("temperature", 0.0)) / 12**0.5)
-    digit = np.asarray(digits.get("rotational_temperature", 0.0))
-    of_rotation = np.hypot(of_rotation, digit / 12**0.5)
-    return np.stack([of_T, of_rotation], axis=1), notes
+    return np.hypot(np.stack([of_T, of_rotation], axis=1), rounding_errors(measurement)), notes
 
 
 def _used(
-    measurement: Measurement, values: Float[np.ndarray, "times 2"], fits_T_0: bool
+    measurement: Measurement,
+    values: Float[np.ndarray, "times 2"],
+    errors: Float[np.ndarray, "times 2"],
+    fits_T_0: bool,
 ) -> Float[np.ndarray, "times 2"]:
     """Return 1 where a value counts, 0 elsewhere.
 
-    A value at t = 0 without an error is the T_0 of the run.
+    A value at t = 0 is the T_0 of the run, unless it has an error beyond its rounding.
     """
     curve = measurement.curve
     used = np.ones_like(values)
     used[:, 1] = float(_has_rotation(measurement))
-    if np.asarray(curve.times)[0] == 0 and not _has_error_at_first(measurement):
-        used[0, 0] = float(fits_T_0)
-        used[0, 1] = 0.0
+    if np.asarray(curve.times)[0] == 0:
+        of_T, of_rotation = errors[0] > BEYOND_ROUNDING * rounding_errors(measurement)[0]
+        used[0, 0] = float(of_T or fits_T_0)
+        used[0, 1] *= float(of_rotation)
     error = curve.rotational_temperature_error
     used[:, 1] *= (values[:, 1] > 0) | (np.asarray(0.0 if error is None else error) > 0)
     return used
@@ -142,12 +148,6 @@ def _finite_size_factor(measurement: Measurement) -> float:
     """Return the factor by which the measured gas cools faster because N is small."""
     N = measurement.num_particles
     return 1.0 if N is None else float(finite_size_cooling_factor(measurement.gas, float_array(N)))
-
-
-def _has_error_at_first(measurement: Measurement) -> bool:
-    error = measurement.curve.temperature_error
-    counts = measurement.replicas == 1 or measurement.errors_measured
-    return error is not None and counts and float(error[0]) > 0
 
 
 def _errors_of_measurement(

@@ -16,6 +16,7 @@ BUDGET_PARTS = {
     "measurement": "errors of the points",
     "model": "error of the model's cooling rate in this scene",
     "few particles": "random collisions of N particles",
+    "sampling": "the mean over tracked grains in place of all",
     "slope": "error of derivatives through particles: large if the gas has a flow, or noisy",
     "simulation": "noise of the simulations of the fit",
     "calibration": "error of the scale of T, common to all points",

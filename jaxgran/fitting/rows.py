@@ -16,6 +16,9 @@ from jaxgran.fitting.parameters import with_parameters
 from jaxgran.models.linearise import with_coulomb_limit, with_variant_law
 from jaxgran.scene.gas import Gas
 
+BEYOND_ROUNDING = 1.001
+"""Ratio of an error to the one of rounding, above which a value has an error of measurement."""
+
 SCATTER = "scatter of N"
 """Nuisance parameter: the logarithm of the scatter of N grains over what theory gives."""
 
@@ -150,6 +153,12 @@ class CurveRows:
     def num_points(self) -> int:
         """Number of times at which T counts."""
         return int(np.sum(self.used[:, 0]))
+
+    @property
+    def has_errors(self) -> bool:
+        """Whether T has errors of measurement beyond the rounding of the file."""
+        rounding = rounding_errors(self.measurement)[:, 0]
+        return bool(np.any(self.errors[:, 0] > BEYOND_ROUNDING * rounding))
 
     @property
     def uses_rotation(self) -> bool:
@@ -323,3 +332,12 @@ def most_likely_scatter(residuals: np.ndarray, errors: np.ndarray) -> float:
     least = 2 * np.log(MIN_SCATTER * np.min(errors))
     found = scipy.optimize.minimize_scalar(misfit, bounds=(least, largest), method="bounded")
     return float(np.exp(found.x / 2))
+
+
+def rounding_errors(measurement: Measurement) -> Float[np.ndarray, "times 2"]:
+    """Return the standard errors of T and T_rot by the rounding of the file, 0 without a file."""
+    digits = measurement.rounding
+    times = measurement.curve.times.shape
+    names = ("temperature", "rotational_temperature")
+    each = [np.broadcast_to(np.asarray(digits.get(name, 0.0)), times) for name in names]
+    return np.stack(each, axis=1) / 12**0.5

@@ -24,6 +24,7 @@ from jaxgran.fitting.estimate import (
 from jaxgran.fitting.goodness import goodness
 from jaxgran.fitting.information import (
     FEW_PARTICLES,
+    SAMPLING,
     undetermined,
 )
 from jaxgran.fitting.measured_rows import curve_rows, with_rate_error
@@ -213,7 +214,7 @@ def _covariances(
     to_si = scale * covariance
 
     parts = {}
-    for name in ("measurement", FEW_PARTICLES, "model"):
+    for name in ("measurement", FEW_PARTICLES, SAMPLING, "model"):
         by_source = information_by(comparison, expansion.slopes, name) / expansion.scatter
         parts[name] = to_si @ by_source @ to_si.T
     parts["simulation"] = scale * average.noise * scale.T
@@ -228,7 +229,7 @@ def _covariances(
     # A slope that is too large by the bias widens the statistical error, and moves the estimate in
     # proportion to its distance from the simulations.
     distance = scale[:, 0] * (average.flat - np.mean([s.flat for s in search.near], axis=0))
-    statistical = parts["measurement"] + parts["simulation"] + parts[FEW_PARTICLES]
+    statistical = sum(parts[x] for x in ("measurement", "simulation", FEW_PARTICLES, SAMPLING))
     parts["slope"] = ((1 + bias) ** 2 - 1) * statistical + bias**2 * np.outer(distance, distance)
     return {name: part for name, part in parts.items() if np.any(part)}
 
@@ -261,12 +262,14 @@ def _result(
     if bias >= MIN_REPORTED_BIAS:
         notes.append(say("slopes", share=100 * bias))
     residuals = expansion.residuals
+    (whole,) = average.comparison.residuals(0)
+    log_variance = whole.log_variance + np.log(expansion.scatter)
     rows = Residuals(
         "curve",
         "",
         residuals,
         -expansion.sensitivity,
-        np.zeros(residuals.size),
+        log_variance,
         np.zeros_like(expansion.sensitivity),
     )
     found = summed([rows], {})
@@ -299,7 +302,10 @@ def _result(
         iterations=search.num_simulations,
         trace=search.trace,
     )
-    return with_messages(request, result, explanations, notes, 0.0)
+    used = sims.theory.used[:, 0] > 0
+    relative = sims.theory.errors[:, 0] / np.asarray(search.curve.temperature)
+    share = np.mean((relative**2 / np.exp(log_variance[: relative.size]))[used])
+    return with_messages(request, result, explanations, notes, float(share))
 
 
 def _smoothness_rows(problem: Problem, flat: np.ndarray) -> np.ndarray:

@@ -149,7 +149,7 @@ def choose_model(
 
     >>> choice = jaxgran.choose_model(gas, times, num_particles=200)
     >>> choice.reasons[0][:43]
-    'Kinetic theory: the fastest model whose es'
+    'Kinetic theory: the fastest model whose est'
     """
     checked_gas(gas)
     if any_traced(gas, times):

@@ -151,3 +151,19 @@ def test_two_copies_are_one_measurement(write):
         copies = {"a": first, "b": read_measurement(write(other))}
         with pytest.raises(ValueError, match="'a' and 'b' .*same values"):
             jaxgran.fit(copies)
+
+
+@pytest.mark.parametrize("order", [("box", "drops"), ("drops", "box")])
+def test_a_drop_test_may_come_first(dilute, order):
+    """The parameters of a fit are those of its curves, whatever comes first."""
+    walls = jaxgran.Walls(0.1, restitution=0.9)
+    box = dataclasses.replace(dilute, container=walls)
+    times = np.geomspace(1.0, 30.0, 12) * float(box.mean_free_time)
+    curve = jaxgran.cool(box, times, progress=False)
+    data = {
+        "box": jaxgran.Measurement(box, jaxgran.CoolingCurve(times, curve.temperature)),
+        "drops": of_drops(dilute, drop_test(dilute, jax.random.key(5))),
+    }
+    free = (A, "wall_restitution")
+    result = jaxgran.fit({x: data[x] for x in order}, free=free, quick=True, progress=False)
+    assert result.names == (A, "wall_coefficient")

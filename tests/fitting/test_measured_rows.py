@@ -1,0 +1,87 @@
+"""How a measured curve becomes rows: which values count, and with which errors."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import jaxgran
+from jaxgran.fitting.candidates import with_duration, with_second_density
+from jaxgran.fitting.measured_rows import curve_rows
+from tests.beads import glass_beads
+from tests.fitting.curves import A, rough_beads
+
+GAS = glass_beads()
+TIMES = np.append(0.0, np.geomspace(0.5, 60.0, 20)) * float(GAS.mean_free_time)
+CURVE = jaxgran.cool(GAS, TIMES, progress=False)
+T = np.asarray(CURVE.temperature)
+
+
+def rows_of(gas=GAS, fits_T_0=False, **known):
+    names = ("temperature_error", "rotational_temperature", "rotational_temperature_error")
+    columns = {name: known.pop(name) for name in names if name in known}
+    curve = jaxgran.CoolingCurve(TIMES, T, **columns)
+    measurement = jaxgran.Measurement(gas, curve, **known)
+    theory = jaxgran.KineticTheory()
+    return curve_rows("", measurement, theory, fits_T_0=fits_T_0, fits_t0=False)[0]
+
+
+def test_the_rounding_of_a_file_is_no_error_of_the_measurement():
+    digits = {"temperature": 1e-9}
+    assert not rows_of(num_particles=2000, rounding=digits).has_errors
+    assert rows_of(num_particles=2000, rounding=digits, temperature_error=0.01 * T).has_errors
+
+
+def test_the_first_value_counts_by_the_error_that_is_used():
+    chance = (2 / (3 * 1000)) ** 0.5 * T  # of independent grains: not an error
+    known = {"num_particles": 1000, "rounding": {"temperature": 1e-9}}
+    assert rows_of(**known, temperature_error=chance).used[0, 0] == 0
+    assert rows_of(**known, temperature_error=chance, fits_T_0=True).used[0, 0] == 1
+    measured = rows_of(**known, temperature_error=0.3 * chance)
+    assert measured.used[0, 0] == float(measured.errors[0, 0] > 1e-6 * T[0])
+    # T_rot has errors of its own.
+    known = {"temperature_error": 0.01 * T, "rotational_temperature": 0.1 * T}
+    assert list(rows_of(rough_beads(), **known).used[0]) == [1, 0]
+    both = known | {"rotational_temperature_error": 0.01 * T}
+    assert list(rows_of(rough_beads(), **both).used[0]) == [1, 1]
+
+
+def test_the_error_of_tracked_grains_is_in_the_budget():
+    noise = 0.03 * jax.random.normal(jax.random.key(0), T.shape)
+    curve = jaxgran.CoolingCurve(TIMES, T * np.exp(noise), temperature_error=1e-3 * T)
+    known = {"num_particles": 1000, "errors_measured": True}
+    errors = []
+    for tracked in (None, 50):
+        measurement = jaxgran.Measurement(GAS, curve, tracked=tracked, **known)
+        result = jaxgran.fit(measurement, quick=True, progress=False)
+        errors.append(result.standard_error[0])
+    assert errors[1] > 1.5 * errors[0]
+    assert result.error_budget["sampling"][0] > 0.5 * errors[1]
+
+
+def test_plans_keep_the_start_of_a_late_clock():
+    t0 = 100 * float(GAS.mean_free_time)
+    late = dataclasses.replace(CURVE, times=CURVE.times + t0)
+    measurement = jaxgran.Measurement(GAS, late, num_particles=1000, priors={"t0": (t0, 0.1)})
+    longer = np.asarray(with_duration(measurement, 2.0).curve.times)
+    assert longer[0] == pytest.approx(t0)
+    assert longer[-1] - t0 == pytest.approx(2 * TIMES[-1])
+    denser = np.asarray(with_second_density(measurement)["second density"].curve.times)
+    ratio = (denser[1:] - t0) / TIMES[1:]
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_imitations_begin_with_the_gas():
+    t0 = 20 * float(GAS.mean_free_time)
+    error = t0 / 40
+    late = jaxgran.CoolingCurve(TIMES[1:] + t0, T[1:], temperature_error=0.02 * T[1:])
+    known = {"num_particles": 250, "priors": {"t0": (t0, error)}, "errors_measured": True}
+    absent = ("walls", "roughness", "drag", "friction")
+    measurement = jaxgran.Measurement(GAS, late, absent=absent, **known)
+    result = jaxgran.fit(measurement, progress=False)
+    assert abs(result.start_time[""] - t0) < 3 * error
+    imitation = jaxgran.imitate(result, runs=6, progress=False)
+    ratio = imitation.estimate / float(result.gas.value(A))
+    assert np.all(np.abs(np.log(ratio)) < 0.3)
