@@ -198,7 +198,7 @@ def fit(
 
 
 def _by_label(measurement: Any) -> dict[str, Measurement]:
-    """Return measurements by label; the label of a single measurement is ""."""
+    """Return measurements by label, drop tests last; the label of a single measurement is ""."""
     if isinstance(measurement, Measurement):
         return {"": measurement}
     if not isinstance(measurement, dict):
@@ -215,7 +215,8 @@ def _by_label(measurement: Any) -> dict[str, Measurement]:
                 f"{label!r} must be a jaxgran.Measurement, got {_kind(value)}. {HOW_TO_MEASURE}"
             )
     _check_no_copies(measurement)
-    return dict(measurement)
+    # Curves come first: their gases have the parameters that drop tests do not depend on.
+    return dict(sorted(measurement.items(), key=lambda pair: isinstance(pair[1].data, DropTest)))
 
 
 def _check_no_copies(measurements: dict[str, Measurement]) -> None:

@@ -103,7 +103,7 @@ class Problem:
             separate: names of free parameters that each curve has separately.
         """
         curves = [m for m in measurements if isinstance(m, CurveRows)]
-        gas = next((m.gas for m in curves), measurements[0].gas)
+        gas = measurements[0].gas
 
         def unknown(name: str, label: str | None, gas: Gas) -> Unknown:
             domain = domain_of(gas, name)
