@@ -222,6 +222,8 @@ def _covariances(
         parts[SMOOTHNESS] = to_si @ prior_rows.T @ prior_rows @ to_si.T
     others = {name: prior for name, prior in priors.items() if name != SMOOTHNESS}
     effects = prior_effects(gas, others, search.curve, sims.rows.uses_rotation)
+    scale_of_T = sims.rows.measurement.calibration_error
+    effects["calibration"] = np.full((expansion.computed.size, 1), scale_of_T)
     for name, change in effects.items():
         whitened = comparison.whiten(change) / expansion.scatter**0.5
         moved = to_si @ sensitivity.T @ whitened
@@ -251,12 +253,16 @@ def _result(
     bias = derivative_bias(sims, search, gas, expansion.sensitivity)
     priors = request.priors.get("", {})
     covariances = _covariances(priors, sims, search, expansion, gas, bias)
+    # The range, by kinetic theory, knows all other parts.
+    further = [covariances[x] for x in (*priors, "slope") if x in covariances]
+    scale = problem.slopes(flat)
+    noise = average.noise + sum(further, np.zeros((p, p))) / np.outer(scale, scale)
     if p > MAX_LINEARISED:
         covariances = {name: np.full_like(part, np.nan) for name, part in covariances.items()}
     explanations = None
     if search.converged and not request.quick:
         if set(request.names) <= of_theory.measurements[""].gas.domains.keys():
-            explanations = _explanations(of_theory, sims, flat, expansion.computed, average.noise)
+            explanations = _explanations(of_theory, sims, flat, expansion.computed, noise)
         else:
             notes.append(NOT_COMPARED)
     if bias >= MIN_REPORTED_BIAS:

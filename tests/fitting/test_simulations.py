@@ -44,6 +44,24 @@ def test_fit_through_soft_spheres_finds_what_made_the_curve():
     assert float(error) < 0.15 * gas.value(A) and result.converged
 
 
+@pytest.mark.slow
+def test_errors_of_priors_and_of_the_scale_are_in_the_error_bar_and_the_range():
+    gas = glass_beads()
+    curve = synthetic(gas, jax.random.key(0), 20, 0.005, 30.0)
+    known = {"num_particles": 10_000, "absent": ("walls", "roughness", "drag", "friction")}
+    model = jaxgran.DSMC(2000, replicas=2)
+
+    def widths(**further):
+        measurement = jaxgran.Measurement(gas, curve, errors_measured=True, **known, **further)
+        result = jaxgran.fit(measurement, free=(A,), model=model, progress=False)
+        low, high = (float(x[0]) for x in result.ranges[A])
+        return np.array([float(result.standard_error[0]), high - low]) / gas.value(A)
+
+    plain = widths()
+    assert np.all(widths(priors={"packing_fraction": (0.05, 0.01)}) > 0.2 + plain)
+    assert np.all(widths(calibration_error=0.3) > 1.3 * plain)
+
+
 # --- a stand-in whose parameters are known
 
 GAS = glass_beads()
