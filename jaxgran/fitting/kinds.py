@@ -172,7 +172,7 @@ KINDS = (
         parameters=(WHITE,),
         amplitudes=(WHITE_ERRORS,),
         values=lambda error, curve: {WHITE: error},
-        applies=lambda problem: not all(m.has_errors for m in problem.curves),
+        applies=lambda problem: not all(np.any(m.errors[:, 0] > 0) for m in problem.curves),
     ),
     Kind(
         name=ROUGHNESS_ADDED,

@@ -155,12 +155,6 @@ class CurveRows:
         return int(np.sum(self.used[:, 0]))
 
     @property
-    def has_errors(self) -> bool:
-        """Whether T has errors of measurement beyond the rounding of the file."""
-        rounding = rounding_errors(self.measurement)[:, 0]
-        return bool(np.any(self.errors[:, 0] > BEYOND_ROUNDING * rounding))
-
-    @property
     def uses_rotation(self) -> bool:
         """Whether T_rot is compared."""
         return bool(np.any(self.used[:, 1]))

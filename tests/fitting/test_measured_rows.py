@@ -27,12 +27,6 @@ def rows_of(gas=GAS, fits_T_0=False, **known):
     return curve_rows("", measurement, theory, fits_T_0=fits_T_0, fits_t0=False)[0]
 
 
-def test_the_rounding_of_a_file_is_no_error_of_the_measurement():
-    digits = {"temperature": 1e-9}
-    assert not rows_of(num_particles=2000, rounding=digits).has_errors
-    assert rows_of(num_particles=2000, rounding=digits, temperature_error=0.01 * T).has_errors
-
-
 def test_the_first_value_counts_by_the_error_that_is_used():
     chance = (2 / (3 * 1000)) ** 0.5 * T  # of independent grains: not an error
     known = {"num_particles": 1000, "rounding": {"temperature": 1e-9}}
