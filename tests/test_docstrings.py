@@ -29,10 +29,12 @@ def names():
 
 # Each compiles a fit of several curves, all alternatives, or a run of spheres.
 LONG = (
-    *("Choice", "DSMC", "Expected", "Imitation", "Plan", "SteadyState", "explain_status", "impact"),
-    *("imitate", "log_likelihood", "observables", "plan", "read_particles", "sweep"),
+    *("Choice", "DSMC", "Expected", "SteadyState", "explain_status", "impact"),
+    *("imitate", "observables", "read_particles", "sweep"),
 )
-NAMES = [pytest.param(x, marks=pytest.mark.slow) if x in LONG else x for x in jaxgran.__all__]
+MINUTES = ("Imitation", "Plan", "log_likelihood", "plan")
+MARKS = dict.fromkeys(LONG, pytest.mark.slow) | dict.fromkeys(MINUTES, pytest.mark.minutes)
+NAMES = [pytest.param(x, marks=MARKS.get(x, ())) for x in jaxgran.__all__]
 NAMES += [f"extend.{name}" for name in jaxgran.extend.__all__]
 
 

@@ -140,7 +140,7 @@ def test_a_spline_may_lose_nothing():
     assert np.all(np.isfinite(slope))
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 def test_a_law_is_learnt_from_a_curve(caplog):
     true = glass_beads(0.15)
     curve = synthetic(true)

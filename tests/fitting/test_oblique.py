@@ -144,7 +144,7 @@ def test_the_published_pair_of_alumina_and_glass():
     assert result.standard_error[0] < 0.003 and result.standard_error[1] < 0.004
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 @pytest.mark.filterwarnings("ignore:this curve does not determine")
 def test_a_curve_with_oblique_impacts_determines_a():
     """T(t) alone does not tell roughness from A; impacts do."""

@@ -151,7 +151,7 @@ def begun(monkeypatch):
     return begin
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 def test_noise_of_slopes_does_not_move_the_answer(begun):
     """Runs whose noise grows with A: the noise of a slope is that of the values, times 3."""
     sims, flat = begun(StandIn(noise=1e-6), first=TRUTH)

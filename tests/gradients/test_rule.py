@@ -35,7 +35,7 @@ HEATING = ("dissipative_constant", -1e-6)
 NAN_CASES = [
     (jaxgran.KineticTheory(), *DENSE),
     pytest.param(jaxgran.KineticTheory(), *HEATING, marks=pytest.mark.slow),
-    pytest.param(jaxgran.DSMC(20, replicas=2), *HEATING, marks=pytest.mark.slow),
+    pytest.param(jaxgran.DSMC(20, replicas=2), *HEATING, marks=pytest.mark.minutes),
     pytest.param(jaxgran.HardSpheres(20).sized_for(GAS), *DENSE, marks=pytest.mark.minutes),
     pytest.param(jaxgran.SoftSpheres(20).sized_for(GAS), *HEATING, marks=pytest.mark.minutes),
 ]

@@ -64,7 +64,7 @@ def test_single_precision_has_no_trend(kind):
         jaxgran.KineticTheory(),
         DSMC,
         pytest.param(jaxgran.HardSpheres(20), marks=pytest.mark.minutes),
-        pytest.param(SOFT, marks=pytest.mark.slow),
+        pytest.param(SOFT, marks=pytest.mark.minutes),
     ],
 )
 def test_models_run_without_promotion_of_types(model):

@@ -107,7 +107,7 @@ def test_every_pair_is_about_equally_likely(n):
     assert np.all(np.abs(each - 1) < 6 / (2 * i.size / n) ** 0.5)
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 def test_the_step_is_second_order():
     # Memory of the first velocity, 2/3 (1 + eps)/2 per collision, feels the step most.
     gas, n = constant(0.6), 200_000
@@ -121,7 +121,7 @@ def test_the_step_is_second_order():
     assert abs(np.log(memory(0.1) / memory(0.025))) < 2.5 * noise
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 def test_says_when_impacts_are_too_fast(monkeypatch):
     gas = glass_beads(0.15)
     times = jnp.array([3.0]) * gas.mean_free_time

@@ -219,7 +219,7 @@ def test_steps_with_friction_are_of_second_order():
     np.testing.assert_allclose((ends[0] - ends[1]) / (ends[1] - ends[2]), 4.0, rtol=0.04)
 
 
-@pytest.mark.slow  # compiles derivatives in six floats
+@pytest.mark.minutes  # compiles derivatives in six floats
 def test_derivatives_with_friction_of_a_short_run_are_differences():
     # Frictional spheres between frictional walls of three sides, with drag.
     h, gas = 1e-6, soft()

@@ -119,7 +119,7 @@ def test_large_boxes_are_searched_by_cells():
     assert engines == ["sweep", "sweep", "cells"]
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 def test_a_cluster_with_more_spheres_than_a_run_of_cells_holds():
     # All spheres in a corner of the box, 6 times as dense as the gas.
     n, gas = 343, hard_gas(0.9, 0.05)
@@ -141,7 +141,7 @@ def test_a_cluster_with_more_spheres_than_a_run_of_cells_holds():
     assert "neighbour list is full" in jaxgran.explain_status(run("cells", 1.0).status)
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 def test_compiled_runs_of_few_hard_spheres_have_room():
     # Windows of 8 impacts scatter in length: of 60 keys 3 needed more pairs than they had.
     gas = glass_beads(packing_fraction=0.05, youngs_modulus=5e5)

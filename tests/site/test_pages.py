@@ -39,7 +39,7 @@ PRINTED = {
     "laws": "0.972",
     "models": "two replicas (2, 100, 3) True",
 }
-LONG = "plan", "scenes", "sharp_bits", "derivatives", "models", "laws"
+LONG = "devices", "plan", "scenes", "sharp_bits", "derivatives", "models", "laws"
 """Pages whose code runs for a minute or more."""
 WITH_CODE = [
     pytest.param(name, marks=[pytest.mark.minutes] if name in LONG else [])

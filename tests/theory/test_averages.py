@@ -25,7 +25,7 @@ def test_averages_of_constant_restitution():
         np.testing.assert_allclose(moments[:, 0], expected, rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.minutes
 def test_rate_table_is_exact_over_decades():
     laws = [
         glass_beads(0.15).reduced_law,

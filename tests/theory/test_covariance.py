@@ -182,7 +182,7 @@ def test_walls_take_regularly():
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=pytest.mark.slow) if x == "all" else x for x in GASES]
+    "name", [pytest.param(x, marks=pytest.mark.minutes) if x == "all" else x for x in GASES]
 )
 def test_is_positive_symmetric_and_zero_at_the_start(name):
     gas = GASES[name]
