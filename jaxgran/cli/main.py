@@ -16,7 +16,7 @@ from cyclopts import App, CycloptsError, Parameter
 
 import jaxgran
 from jaxgran.cli import common
-from jaxgran.data.curve_file import CSV_SUFFIXES
+from jaxgran.data.curve_file import ARCHIVE_SUFFIX, CSV_SUFFIXES
 from jaxgran.data.files import check_writable, header_count, header_number, name_in_errors
 from jaxgran.data.header import gas_of_header, guesses_of_header
 from jaxgran.data.scene_file import read_scene_file
@@ -189,7 +189,7 @@ def cool(
     picture = out.with_suffix(".png")
     if picture == out:
         raise ValueError(f"--out must not end in .png, got {out}. The picture is named after it.")
-    if out.suffix not in (".npz", *CSV_SUFFIXES):
+    if out.suffix not in (ARCHIVE_SUFFIX, *CSV_SUFFIXES):
         raise ValueError(f"--out must end in .csv or .npz, got {out}.")
     given = _read_scene(scene, until)
     for file in (out, picture):

@@ -58,7 +58,7 @@ HEADER_ALIASES = {
 """Further names of header keys."""
 
 ANGLES = ("deg", "degree", "degrees", "°", "rad", "mrad")
-"""Units of angles, which are no parts of a value, as %."""
+"""Units of angles: an error in one of them is not relative, unlike an error in %."""
 
 COMMENT_SIGNS = "#%"
 """Signs at the beginning of header lines and comments."""

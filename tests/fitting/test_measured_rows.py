@@ -32,8 +32,7 @@ def test_the_first_value_counts_by_the_error_that_is_used():
     known = {"num_particles": 1000, "rounding": {"temperature": 1e-9}}
     assert rows_of(**known, temperature_error=chance).used[0, 0] == 0
     assert rows_of(**known, temperature_error=chance, fits_T_0=True).used[0, 0] == 1
-    measured = rows_of(**known, temperature_error=0.3 * chance)
-    assert measured.used[0, 0] == float(measured.errors[0, 0] > 1e-6 * T[0])
+    assert rows_of(**known, temperature_error=chance, errors_measured=True).used[0, 0] == 1
     # T_rot has errors of its own.
     known = {"temperature_error": 0.01 * T, "rotational_temperature": 0.1 * T}
     assert list(rows_of(rough_beads(), **known).used[0]) == [1, 0]
@@ -50,6 +49,7 @@ def test_the_error_of_tracked_grains_is_in_the_budget():
         measurement = jaxgran.Measurement(GAS, curve, tracked=tracked, **known)
         result = jaxgran.fit(measurement, quick=True, progress=False)
         errors.append(result.standard_error[0])
+    # Alone 50 grains give T to 11 %, and 20 points far apart a part of it: most of the error.
     assert errors[1] > 1.5 * errors[0]
     assert result.error_budget["sampling"][0] > 0.5 * errors[1]
 
@@ -78,4 +78,5 @@ def test_imitations_begin_with_the_gas():
     assert abs(result.start_time[""] - t0) < 3 * error
     imitation = jaxgran.imitate(result, runs=6, progress=False)
     ratio = imitation.estimate / float(result.gas.value(A))
+    # Runs of 250 grains with T to 2 % scatter by some 5 %; from t = 0 on A was 1.9 to 2.6 times it.
     assert np.all(np.abs(np.log(ratio)) < 0.3)
