@@ -128,7 +128,6 @@ def compare_alternatives(
     problem: Problem,
     minima: list[Minimum],
     noise: Float[np.ndarray, "p"],
-    absent: tuple[str, ...],
     is_driven: bool,
 ) -> Explanations | None:
     """Compare a fitted law with its alternatives.
@@ -138,7 +137,6 @@ def compare_alternatives(
         minima: minima of -2 ln L that the data allow.
         noise: standard errors of the free parameters, in their unconstrained scale, that the
             problem does not contain.
-        absent: effects that are known to be absent, see `jaxgran.data.header.ABSENT`.
         is_driven: whether the gas is driven, which has no alternatives.
 
     Returns:
@@ -148,7 +146,7 @@ def compare_alternatives(
     bases = _minima(problem, minima)
     if not bases:
         return None
-    kinds = [] if is_driven else kinds_of(problem, bases[0].flat, absent)
+    kinds = [] if is_driven else kinds_of(problem, bases[0].flat)
     significant = float(scipy.stats.chi2.isf(PREFERENCE_LEVEL / max(len(kinds), 1), 1))
     found = problem.evaluate(bases[0].flat)
     if goodness(problem, found)["smooth_p_value"] < SIGNIFICANCE:
@@ -158,7 +156,7 @@ def compare_alternatives(
         kind: [profile_of(problem, kind, base, base.flat) for base in bases] for kind in kinds
     }
     first = _preferred_element(profiles, bases[0].value - significant)
-    pairs = {} if first is None else _pairs(problem, first, profiles[first], bases[0], absent)
+    pairs = {} if first is None else _pairs(problem, first, profiles[first], bases[0])
     all_profiles = profiles | pairs
     trials = [t for kind in all_profiles if kind.keeps_A for t in _trials(all_profiles[kind])]
     best = min([*bases, *trials], key=lambda trial: trial.value)
@@ -195,12 +193,11 @@ def _pairs(
     first: Kind,
     profiles: list[list[Trial]],
     law: Trial,
-    absent: tuple[str, ...],
 ) -> dict[Kind, list[list[Trial]]]:
     """Return profiles of second effects beside an element, whose amplitude is an unknown.
 
     Args:
-        problem, absent: see `compare_alternatives`.
+        problem: see `compare_alternatives`.
         first: the element.
         profiles: of the element alone.
         law: the fit without it.
@@ -210,7 +207,7 @@ def _pairs(
     if base is None:
         return {}
     found = {}
-    for second in kinds_of(problem, base.flat, absent):
+    for second in kinds_of(problem, base.flat):
         if second.keeps_A:
             pair = replace(
                 second,
@@ -228,9 +225,9 @@ def _with_free_amplitude(
     name = kind.parameters[0]
     values = kind.values_by_label(problem, at_best.amplitude)
     first = [own.pop(name) for own in values.values()]
-    domain = domain_of(problem.curves[0].gas, name)
+    domain = domain_of(next(m.gas for m in problem.curves if m.label in kind.curves), name)
     # Drop tests have the law of impacts, too; other elements belong to each curve.
-    labels = [None] if kind.changes_law else [m.label for m in problem.curves]
+    labels = [None] if kind.changes_law else list(kind.curves)
     unknowns = [Unknown(name, label, (), domain) for label in labels]
     start = [domain.to_free(x) for x in first[: len(labels)]]
     changed = with_wider_rate_error(problem, kind.rate_error(at_best.amplitude))

@@ -224,16 +224,14 @@ def _displacement_residuals(curve: PredictedCurve, measured: Displacement, size:
     diffusive = collisions / (1 + collisions)
     factor = curve.values.get(DISPLACEMENT, 0.0)
     computed = curve.prediction.displacement[curve.place] + factor * diffusive
-    used = measured.errors > 0
-    errors = np.where(used, measured.errors, 1.0)
-    logs = np.log(np.where(used, measured.values, 1.0))
-    values = np.where(used, (logs - computed) / errors, 0.0)
+    used = measured.used
+    values = measured.whitening @ np.where(used, measured.logs - computed, 0.0)
     slopes = np.zeros((values.size, size))
     for element, tangent in zip(curve.elements, curve.tangents, strict=True):
         change = tangent.displacement[curve.place]
         if element.name == DISPLACEMENT:
             change = diffusive * element.slope
-        slopes[:, element.place] = np.where(used, -change / errors, 0.0)
+        slopes[:, element.place] = -measured.whitening @ np.where(used, change, 0.0)
     log_variance = np.zeros(values.size)
     log_slopes = np.zeros_like(slopes)
     return Residuals("displacement", curve.rows.label, values, slopes, log_variance, log_slopes)

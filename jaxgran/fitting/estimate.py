@@ -52,7 +52,7 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
     elif best.converged and not request.quick:
         is_driven = any(m.scene.drive is not None for m in problem.curves)
         noise = np.zeros(problem.num_free)
-        explanations = compare_alternatives(problem, minima, noise, request.absent, is_driven)
+        explanations = compare_alternatives(problem, minima, noise, is_driven)
     result = assembled(request, problem, best, minima, explanations)
     share = measurement_share(problem, problem.evaluate(best.flat))
     if result.p_value < SIGNIFICANCE and not request.quick and not distant:
@@ -309,7 +309,7 @@ def with_messages(
                 limitations.append(limitation)
         if gas.container is not None:
             notes.append(say("gravity"))
-        if N is not None and gas.container is None and "walls" not in request.absent:
+        if N is not None and gas.container is None and "walls" not in m.absent:
             prefix = f"{label}: " if label else ""
             notes.append(f"{prefix}the box of {N} spheres {describe_walls(gas, N)}")
     return with_words(
@@ -317,7 +317,6 @@ def with_messages(
         explanations,
         tuple(limitations),
         notes,
-        request.absent,
         quick=request.quick,
         measurement_share=share,
     )

@@ -12,7 +12,7 @@ from jaxtyping import PRNGKeyArray
 from jaxgran._utils.validation import check_bool, checked_int
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.drop_test import DropTest
-from jaxgran.data.measurement import START_TIME, Measurement, Priors
+from jaxgran.data.measurement import DENSITY, START_TIME, Measurement, Priors
 from jaxgran.fitting.estimate import fit_without_noise
 from jaxgran.fitting.learnt_law import describe_unvisited_knots
 from jaxgran.fitting.measured_rows import unused_displacements, unused_rotation
@@ -34,6 +34,9 @@ from jaxgran.models.checks import checked_gas, checked_key, checked_model
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.scene.gas import Gas, law_fields
 from jaxgran.scene.parameters import BY_SYMBOL, MATERIAL, PARAMETERS, symbol_of
+
+GRAIN_PARAMETERS = ("diameter", "diameter_sd", DENSITY)
+"""Parameters of a scene that several measurements of the same grains share."""
 
 START_TIME_PRIOR = 1.0
 """Standard error of the prior of t0 where T_0 is free too, over the time in which T halves."""
@@ -162,7 +165,6 @@ def fit(
     if model.stochastic:  # of one curve, whose parameters are all its own
         names, separate = (*names, *separate), ()
     descent = None if solver is None else Descent(solver, progress, throw)
-    declared = [m.absent for m in curves.values()] or [()]
     request = Request(
         measurements=measurements,
         model=model,
@@ -170,7 +172,6 @@ def fit(
         separate=separate,
         priors=priors,
         start=start,
-        absent=tuple(x for x in declared[0] if all(x in others for others in declared)),
         quick=quick,
     )
     if model.stochastic:
@@ -269,13 +270,15 @@ def _names(names: Any, gas: Gas) -> tuple[str, ...]:
 def _priors_by_label(measurements: dict[str, Measurement]) -> dict[str, Priors]:
     """Return the priors of shared parameters (`SHARED`) and of each measurement.
 
-    Several measurements share the parameters of the material.
+    Several measurements share the parameters of the material and, if they tell of the same grains,
+    those of the grains.
     """
     parts: dict[str, Priors] = {}
+    of_grains = _common_to_all_grains(measurements)
     for label, m in measurements.items():
         for name, pair in m.priors.items():
             own = name not in PARAMETERS or PARAMETERS[name].belongs_to != MATERIAL
-            own = own or name == "density"
+            own = (own or name == DENSITY) and name not in of_grains
             place = label if own else SHARED
             known = parts.setdefault(place, {}).setdefault(name, pair)
             if not all(np.array_equal(x, y) for x, y in zip(known, pair, strict=True)):
@@ -285,6 +288,20 @@ def _priors_by_label(measurements: dict[str, Measurement]) -> dict[str, Priors]:
                     f"{float(pair[1]):g}: give one of them"
                 )
     return parts
+
+
+def _common_to_all_grains(measurements: dict[str, Measurement]) -> set[str]:
+    """Return the parameters of single grains of which all measurements have one knowledge."""
+    gases = [m.gas for m in measurements.values()]
+    sizes = {(float(np.ravel(x.diameter)[0]), float(np.ravel(x.mass)[0])) for x in gases}
+    if len(sizes) > 1:
+        return set()
+
+    def is_common(name: str) -> bool:
+        pairs = [m.priors[name] for m in measurements.values() if name in m.priors]
+        return all(np.array_equal(pair, pairs[0]) for pair in pairs)
+
+    return {name for name in GRAIN_PARAMETERS if is_common(name)}
 
 
 def free_by_default(measurement: Measurement) -> tuple[str, ...]:

@@ -59,7 +59,7 @@ def _count(problem: Problem, row: Residuals) -> int:
         if m.label == row.label and row.name == "curve":
             return int(np.sum(m.used))
         if m.label == row.label and row.name == "displacement" and m.displacement is not None:
-            return int(np.sum(m.displacement.errors > 0))
+            return int(np.sum(m.displacement.used))
     return row.values.size
 
 

@@ -95,19 +95,20 @@ class Kind:
         amplitudes: values that are tried, in one or two increasing sequences from 0.
         values: values of parameters at an amplitude, beside a fitted curve; parameters of a law of
             impacts do not depend on the curve.
-        applies: whether it is an alternative in a fit whose measurements may have its parameters.
+        applies: whether it is an alternative for a curve that may have its parameters, given the
+            names of the curve's unknowns.
         rate_error: relative error of kinetic theory's cooling rate by it, at an amplitude.
         one_minimum: False if amplitudes beyond excluded ones may be allowed.
         changes_law: whether it is in the law of impacts, which drop tests obey, too.
         keeps_A: False if A has no meaning in it: it is not part of the range.
-        curves: the fitted curves, by label; {} in `KINDS`.
+        curves: the fitted curves that it changes, by label; {} in `KINDS`.
     """
 
     name: str
     parameters: tuple[str, ...]
     amplitudes: tuple[tuple[float, ...], ...]
     values: Callable[[float, FittedCurve], dict[str, float]]
-    applies: Callable[[Problem], bool] = lambda problem: True
+    applies: Callable[[CurveRows, set[str]], bool] = lambda rows, unknowns: True
     rate_error: Callable[[float], float] = lambda amplitude: 0.0
     one_minimum: bool = True
     changes_law: bool = False
@@ -127,24 +128,24 @@ def _walls(share: float, curve: FittedCurve) -> dict[str, float]:
     return {"wall_side": side, "wall_coefficient": WALL_RESTITUTION}
 
 
-def _scenes_are_rough(problem: Problem) -> bool:
-    return all("tangential_restitution" in m.scene.domains for m in problem.curves)
+def _is_rough(rows: CurveRows, unknowns: set[str]) -> bool:
+    return "tangential_restitution" in rows.scene.domains
 
 
-def _laws_are_viscoelastic(problem: Problem) -> bool:
-    return all("exponent" in m.gas.domains for m in problem.curves)
+def _is_viscoelastic(rows: CurveRows, unknowns: set[str]) -> bool:
+    return "exponent" in rows.gas.domains
 
 
-def _varies_A_of_viscoelastic_laws(problem: Problem) -> bool:
-    return _laws_are_viscoelastic(problem) and _varies(problem, "dissipative_constant")
+def _is_viscoelastic_of_free_A(rows: CurveRows, unknowns: set[str]) -> bool:
+    return _is_viscoelastic(rows, unknowns) and "dissipative_constant" in unknowns
 
 
-def _starts_are_known(problem: Problem) -> bool:
-    return not (_varies(problem, START_TIME) or _varies(problem, "temperature"))
+def _start_is_known(rows: CurveRows, unknowns: set[str]) -> bool:
+    return unknowns.isdisjoint({START_TIME, "temperature"})
 
 
-def _varies(problem: Problem, name: str) -> bool:
-    return any(u.name == name for u in problem.unknowns)
+def _has_no_errors(rows: CurveRows, unknowns: set[str]) -> bool:
+    return not np.any(rows.errors[:, 0] > 0)
 
 
 KINDS = (
@@ -172,7 +173,7 @@ KINDS = (
         parameters=(WHITE,),
         amplitudes=(WHITE_ERRORS,),
         values=lambda error, curve: {WHITE: error},
-        applies=lambda problem: not all(np.any(m.errors[:, 0] > 0) for m in problem.curves),
+        applies=_has_no_errors,
     ),
     Kind(
         name=ROUGHNESS_ADDED,
@@ -197,7 +198,7 @@ KINDS = (
         parameters=("friction",),
         amplitudes=(SLIDING,),
         values=lambda x, curve: {"friction": 1 / x},
-        applies=_scenes_are_rough,
+        applies=_is_rough,
         changes_law=True,
     ),
     Kind(
@@ -205,7 +206,7 @@ KINDS = (
         parameters=("spread",),
         amplitudes=(SPREADS,),
         values=lambda x, curve: {"spread": x},
-        applies=_laws_are_viscoelastic,
+        applies=_is_viscoelastic,
         changes_law=True,
     ),
     Kind(
@@ -213,7 +214,7 @@ KINDS = (
         parameters=("exponent",),
         amplitudes=((1.0,),),
         values=lambda x, curve: {"exponent": VISCOELASTIC_EXPONENT * (1 - x)},
-        applies=_varies_A_of_viscoelastic_laws,
+        applies=_is_viscoelastic_of_free_A,
         changes_law=True,
         keeps_A=False,
     ),
@@ -222,36 +223,43 @@ KINDS = (
         parameters=(START_TIME,),
         amplitudes=(DELAYS, tuple(-x for x in DELAYS)),
         values=lambda share, curve: {START_TIME: -share / curve.rate},
-        applies=_starts_are_known,
+        applies=_start_is_known,
     ),
 )
 """All kinds of alternatives: a further explanation is a further row."""
 
 
-def kinds_of(problem: Problem, flat: np.ndarray, absent: tuple[str, ...]) -> list[Kind]:
+def kinds_of(problem: Problem, flat: np.ndarray) -> list[Kind]:
     """Return the kinds of alternatives to a fit.
+
+    Each one changes the curves whose files do not say whether they have its effect; one in the law
+    of impacts changes all measurements, or none.
 
     Args:
         problem: of the fit.
         flat: the fitted unknowns, in their unconstrained scale.
-        absent: effects that are known to be absent, see `jaxgran.data.header.ABSENT`.
     """
-    if not problem.curves:
-        return []
     curves = _fitted_curves(problem, flat)
-    known = {u.name for u in problem.unknowns}
-    known |= {DECLARABLE[name][0] for name in absent}
-    known |= {name for m in problem.curves for name in m.scene.domains}
+    kinds = []
+    for kind in KINDS:
+        changed = {m.label: curves[m.label] for m in problem.curves if _is_open(kind, problem, m)}
+        if changed and (len(changed) == len(curves) or not kind.changes_law):
+            kinds.append(replace(kind, curves=changed))
+    return kinds
+
+
+def _is_open(kind: Kind, problem: Problem, rows: CurveRows) -> bool:
+    """Tell whether a curve may have what an alternative adds, without its file saying so."""
+    unknowns = {u.name for u in problem.unknowns if u.label in (None, rows.label)}
+    absent = {DECLARABLE[name][0] for name in rows.measurement.absent}
+    described = unknowns | absent | {*rows.scene.domains}
     # Spheres of unequal sizes have neither walls nor roughness.
-    supported = {FLOOR, WHITE, START_TIME}
-    supported |= set.intersection(*({*m.gas.domains} for m in problem.curves))
-    return [
-        replace(kind, curves=curves)
-        for kind in KINDS
-        if known.isdisjoint(kind.parameters)
+    supported = {FLOOR, WHITE, START_TIME, *rows.gas.domains}
+    return (
+        described.isdisjoint(kind.parameters)
         and supported.issuperset(kind.parameters)
-        and kind.applies(problem)
-    ]
+        and kind.applies(rows, unknowns)
+    )
 
 
 def side_of_walls(gas: Gas, rate: float) -> float:

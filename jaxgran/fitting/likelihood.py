@@ -216,11 +216,8 @@ def _likelihood_of_displacement(
     """Return the logarithm of the likelihood of <dr^2>."""
     assert computed.displacement is not None
     collisions = nodes.collisions[place]
-    used = measured.errors > 0
-    errors = np.where(used, measured.errors, 1.0)
     diffusive = collisions / (1 + collisions)
-    values = jnp.log(np.where(used, measured.values, 1.0))
-    difference = values - jnp.log(jnp.where(used, computed.displacement[place], 1.0))
-    columns = jnp.stack([difference, diffusive], axis=-1)
-    weights = jnp.asarray(used / errors**2)
+    known = jnp.where(measured.used, computed.displacement[place], 1.0)
+    columns = measured.whitening @ jnp.stack([measured.logs - jnp.log(known), diffusive], axis=-1)
+    weights = jnp.ones(measured.logs.shape)
     return -0.5 * _without_factors(columns, weights, jnp.asarray([measured.accuracy]))

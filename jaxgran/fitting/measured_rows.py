@@ -57,6 +57,10 @@ def curve_rows(
     gas = measurement.gas
     values = _values(measurement)
     errors, notes = _errors(measurement, values)
+    displacement = None
+    if not fits_t0:
+        displacement, of_displacement = _displacement(measurement, model)
+        notes += of_displacement
     accuracy = float(model.rotation_accuracy(gas)) if _has_rotation(measurement) else 0.0
     rows = CurveRows(
         label=label,
@@ -70,7 +74,7 @@ def curve_rows(
         unit_time=float(scales_at(gas).mean_free_time),
         rate_error=(np.zeros(1), np.zeros(1)),
         rotation_accuracy=accuracy,
-        displacement=None if fits_t0 else _displacement(measurement, model),
+        displacement=displacement,
     )
     return rows, notes
 
@@ -181,39 +185,55 @@ def _errors_of_measurement(
         if ratio.size and np.all(np.abs(ratio - 1) < ERRORS_OF_PARTICLES):
             notes.append(
                 f"{name} equals the fluctuation of independent samples of {N} grains and is not "
-                "used: the energy of all grains of one run fluctuates less. If these are errors of "
-                "the measurement, say so: `errors: measured`"
+                "used: values of one run are correlated, and energies fluctuate less. If these "
+                "are errors of the measurement, say so: `errors: measured`"
             )
             return nothing
     return error
 
 
-def _displacement(measurement: Measurement, model: AbstractModel) -> Displacement | None:
-    """Return <dr^2> if it was measured with errors, or of N grains, and the model knows it.
+def _displacement(
+    measurement: Measurement, model: AbstractModel
+) -> tuple[Displacement | None, list[str]]:
+    """Return <dr^2> if its scatter is known and the model computes it, and notes on its errors.
 
     ln <dr^2> is compared. If a value is below 0, as after noise was subtracted, only values more
     than `NOISE` errors above 0 count.
     """
+    notes: list[str] = []
     curve = measurement.curve
     gas = measurement.gas
-    N = measurement.num_particles
-    if curve.displacement is None:
-        return None
+    N = measurement.tracked or measurement.num_particles
     accuracy = model.displacement_accuracy(gas)
-    if accuracy is None:
-        return None
+    is_known = curve.displacement_error is not None or N is not None
+    if curve.displacement is None or accuracy is None or not is_known:
+        return None, notes
     values = np.asarray(curve.displacement)
-    if curve.displacement_error is None:
-        if N is None:
-            return None
-        relative = np.full(values.shape, (2 / (gas.dimension * N * measurement.replicas)) ** 0.5)
-    else:
-        relative = np.asarray(curve.displacement_error) / np.maximum(values, TINY)
-    used = (values > 0) & (relative > 0)
+    given = curve.displacement_error
+    errors = _errors_of_measurement("dr2_err", measurement, given, values, gas.dimension, notes)
+    is_measured = np.ones(values.shape, bool) if given is None else np.asarray(given) > 0
+    of_grains = 0.0 if N is None else 2 / (gas.dimension * N * measurement.replicas)
+    used = (values > 0) & is_measured
     if np.any(values < 0):
-        used &= NOISE * relative < 1
-    errors = np.where(used, np.hypot(relative, float(accuracy)), 0.0)
-    return Displacement(values, errors, float(accuracy))
+        used &= NOISE * errors < values
+    logs = np.log(np.where(used, values, 1.0))
+    relative = np.hypot(errors / np.maximum(values, TINY), float(accuracy))
+    covariance = np.diag(relative[used] ** 2) + of_grains * _correlation_of_walks(logs[used])
+    whitening = np.zeros((values.size, values.size))
+    factor = np.linalg.cholesky(covariance)
+    whitening[np.ix_(used, used)] = np.linalg.inv(factor)
+    return Displacement(logs, whitening, float(accuracy)), notes
+
+
+def _correlation_of_walks(logs: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n n"]:
+    """Return the correlations of <dr^2> of a number of random walks at some times.
+
+    The displacements at t1 < t2 have the covariance of the first one, so that their squares have
+    the correlation <dr^2>(t1)/<dr^2>(t2). Velocities have a memory, so that the true correlation
+    is larger and errors by <dr^2> are up to 1.8 times too large. Measured: 200 replicas of 200 hard
+    spheres, phi = .05, up to 32 collisions: the mean variance of the residuals is .33.
+    """
+    return np.exp(-np.abs(logs[:, None] - logs[None]))
 
 
 def unused_displacements(measurement: Measurement) -> str | None:

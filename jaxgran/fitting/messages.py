@@ -145,7 +145,6 @@ def with_words(
     explanations: Explanations | None,
     limitations: tuple[Limitation, ...],
     notes: list[str],
-    absent: tuple[str, ...],
     *,
     quick: bool,
     measurement_share: float,
@@ -157,7 +156,6 @@ def with_words(
         explanations: the fitted law and its alternatives; None if they were not compared.
         limitations: of the model in the scenes.
         notes: further reasons.
-        absent: effects that are known to be absent.
         quick: whether the user did not want the alternatives.
         measurement_share: share of the errors of the measurement in the variances of T.
     """
@@ -174,7 +172,7 @@ def with_words(
         *_misfit(result, scatters_more, scatters_less, is_misfit),
         *_scatter(result),
         *_of_each(result),
-        *_alternatives(result, absent, quick),
+        *_alternatives(result, quick=quick),
         *notes,
         *(limitation.words for limitation in limitations),
         *_convergence(result),
@@ -219,8 +217,10 @@ def _range(result: Fit, low: float, high: float) -> str:
 def _headline(result: Fit) -> str:
     """Return the first parameter with its range, and whether it has a meaning."""
     headline = _first_parameter(result)
+    preferred = [x for x in result.alternatives if x.preferred and x.restitution is None]
+    best = max((x.improvement for x in preferred), default=0.0)
     for alternative in result.alternatives:
-        if alternative.restitution is not None and alternative.improvement >= 0:
+        if alternative.restitution is not None and alternative.improvement >= best:
             as_well = "better" if alternative.preferred else "as well"
             return say("constant", headline=headline, eps=alternative.restitution, as_well=as_well)
     return headline
@@ -385,10 +385,10 @@ def _of_each(result: Fit) -> Iterator[str]:
         )
 
 
-def _alternatives(result: Fit, absent: tuple[str, ...], quick: bool) -> Iterator[str]:
+def _alternatives(result: Fit, *, quick: bool) -> Iterator[str]:
     """Yield clauses about preferred or possible alternatives, with the first parameter there."""
     yield _assumptions(result)
-    if absent:
+    if absent := _absent_effects(result):
         yield say("absent", names=", ".join(absent))
     if quick:
         yield say("quick")
@@ -414,6 +414,18 @@ def _alternatives(result: Fit, absent: tuple[str, ...], quick: bool) -> Iterator
                 yield say("outside", estimate=estimate)
         elif not alternative.distinguishable:
             yield say(f"{kind}is possible", **words)
+
+
+def _absent_effects(result: Fit) -> list[str]:
+    """Return the effects that are known to be absent, with the curves if not in all of them."""
+    curves = {k: m for k, m in result.measurements.items() if not isinstance(m.data, DropTest)}
+    effects = dict.fromkeys(effect for m in curves.values() for effect in m.absent)
+    found = []
+    for effect in effects:
+        labels = [label for label, m in curves.items() if effect in m.absent]
+        in_all = len(labels) == len(curves)
+        found.append(effect if in_all else f"{effect} ({', '.join(labels)})")
+    return found
 
 
 def _assumptions(result: Fit) -> str:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import scipy  # which imports scipy.optimize at its first use
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.drop_test import DropTest
@@ -91,15 +91,20 @@ class Displacement(NamedTuple):
     """A measured <dr^2>.
 
     Attributes:
-        values: m^2.
-        errors: relative standard errors, with the accuracy of the model at each time; 0 where a
-            value does not count.
+        logs: ln <dr^2>, <dr^2> in m^2; 0 where a value does not count.
+        whitening: matrix that makes residuals of `logs` independent, of variance 1; its rows and
+            columns are 0 where a value does not count.
         accuracy: relative accuracy of the model, which applies to a common factor, too.
     """
 
-    values: Float[np.ndarray, "times"]
-    errors: Float[np.ndarray, "times"]
+    logs: Float[np.ndarray, "times"]
+    whitening: Float[np.ndarray, "times times"]
     accuracy: float
+
+    @property
+    def used(self) -> Bool[np.ndarray, "times"]:
+        """Whether a value counts."""
+        return np.diag(self.whitening) > 0
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,6 @@ class Request:
         separate: of those that each curve has separately.
         priors: of shared parameters and of each measurement.
         start: a further guess; None without one.
-        absent: effects that are known to be absent in all curves.
         quick: whether alternatives are left out.
     """
 
@@ -48,7 +47,6 @@ class Request:
     separate: tuple[str, ...]
     priors: dict[str, Priors]
     start: Gas | None
-    absent: tuple[str, ...]
     quick: bool
 
     @property

@@ -347,7 +347,7 @@ def _explanations(
     is_driven = rows.scene.drive is not None
     errors = np.sqrt(np.diag(noise))
     minimum = Minimum(start, 0.0, 0, True)
-    return compare_alternatives(problem, [minimum], errors, of_theory.absent, is_driven)
+    return compare_alternatives(problem, [minimum], errors, is_driven)
 
 
 def derivative_bias(sims: Simulations, search: Search, gas: Gas, sensitivity: np.ndarray) -> float:

@@ -9,6 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran import read_measurement
+from jaxgran.fitting.kinds import WALLS_ADDED
 from jaxgran.scene.laws import ViscoelasticVariant
 from tests.beads import glass_beads
 from tests.data.curve_files import IN_MM, PLAIN, TIMES, T, text_of
@@ -168,3 +169,40 @@ def test_a_drop_test_may_come_first(order):
     free = (A, "wall_restitution")
     result = jaxgran.fit({x: data[x] for x in order}, free=free, quick=True, progress=False)
     assert result.names == (A, "wall_coefficient")
+
+
+@pytest.mark.parametrize(
+    ("second_diameter", "ratio"),
+    [(1.0, 1.0), pytest.param(1.5, 0.5**0.5, id="other grains")],
+)
+def test_curves_of_the_same_grains_share_the_error_of_their_density(second_diameter, ratio):
+    """The density of the same grains is not known better by being told twice."""
+    gas = glass_beads(0.1)
+    diameter = second_diameter * np.asarray(gas.diameter)
+    other = gas.replace(diameter=diameter, mass=jaxgran.sphere_mass(diameter, 2500.0))
+    data = {}
+    for label, own, num in (("first", gas, 40), ("second", other, 30)):
+        prior = {"density": (2500.0, 1250.0)}
+        curve = synthetic(own, num_points=num)
+        data[label] = jaxgran.Measurement(own, curve, num_particles=10**8, priors=prior)
+    alone = jaxgran.fit(data["first"], quick=True)
+    both = jaxgran.fit(data, quick=True)
+    found = float(both.standard_error[0] / alone.standard_error[0])
+    assert found == pytest.approx(ratio, abs=0.05)
+
+
+def test_an_effect_that_one_curve_tells_stays_possible_in_another():
+    """Walls that one file describes, or excludes, do not exclude walls of another container."""
+    gas = glass_beads(0.1)
+    in_box = dataclasses.replace(gas, container=jaxgran.Walls(0.05, restitution=0.7))
+    told = jaxgran.Measurement(in_box, synthetic(in_box), num_particles=300)
+    untold = dataclasses.replace(told, gas=gas, data=synthetic(in_box, num_points=30))
+    both = jaxgran.fit({"told": told, "untold": untold}, progress=False)
+    walls = next(x for x in both.alternatives if x.name == WALLS_ADDED)
+    assert walls.preferred and in_range(both, gas.value(A))
+    assert "coefficient of restitution" not in both.headline  # walls explain the data better
+    free = dataclasses.replace(told, gas=gas, data=synthetic(gas), absent=("walls",))
+    other = dataclasses.replace(free, data=synthetic(gas, num_points=30), absent=())
+    both = jaxgran.fit({"free": free, "other": other}, progress=False)
+    assert any(x.effect == "walls" for x in both.alternatives)
+    assert any("walls (free)" in reason for reason in both.reasons)

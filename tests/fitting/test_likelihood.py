@@ -69,7 +69,7 @@ def test_the_filter_is_the_dense_covariance(name):
 def test_the_likelihood_is_that_of_the_fit():
     gas, curve = cooled_beads()
     measurement = jaxgran.Measurement(gas, curve, num_particles=10**6)
-    request = Request({"": measurement}, THEORY, (A,), (), {}, None, (), quick=True)
+    request = Request({"": measurement}, THEORY, (A,), (), {}, None, quick=True)
     problem, first, _ = build_problem(request)
     # The error of theory is that of the first guess of A, here as in `log_likelihood`.
     problem = problem_with_rate_errors(problem, first)

@@ -10,7 +10,7 @@ import jaxgran
 from jaxgran.fitting.candidates import with_duration, with_second_density
 from jaxgran.fitting.measured_rows import curve_rows
 from tests.beads import glass_beads
-from tests.fitting.curves import A, rough_beads
+from tests.fitting.curves import A, cooled_beads, fitted, rough_beads
 
 GAS = glass_beads()
 TIMES = np.append(0.0, np.geomspace(0.5, 60.0, 20)) * float(GAS.mean_free_time)
@@ -80,3 +80,16 @@ def test_imitations_begin_with_the_gas():
     ratio = imitation.estimate / float(result.gas.value(A))
     # Runs of 250 grains with T to 2 % scatter by some 5 %; from t = 0 on A was 1.9 to 2.6 times it.
     assert np.all(np.abs(np.log(ratio)) < 0.3)
+
+
+def test_displacements_of_the_same_grains_do_not_average():
+    """More times tell little more: <dr^2> of N grains is one random number, and not a new one."""
+    errors = []
+    for num_points in (20, 80):
+        gas, curve = cooled_beads(
+            relative_error=0.3, num_points=num_points, quantities=("temperature", "displacement")
+        )
+        curve = dataclasses.replace(curve, displacement_error=None)
+        result = fitted(gas, curve, num_particles=100)
+        errors.append(float(result.standard_error[0]))
+    assert errors[1] > 0.7 * errors[0]
