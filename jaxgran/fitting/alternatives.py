@@ -8,7 +8,8 @@ function of the amplitude shows whether the data prefer the alternative, or excl
 the parameters are only as certain as the amplitude.
 
 Where the data prefer an element, the same is done with a second effect beside it: the range then
-allows for one effect more than the data show.
+allows for one effect more than the data show. Where they show independent errors of T, these stay
+beside all other effects: otherwise no smooth effect could be as good.
 """
 
 from collections.abc import Sequence
@@ -21,8 +22,8 @@ from jaxtyping import Float
 
 from jaxgran.fitting.goodness import SIGNIFICANCE, goodness
 from jaxgran.fitting.kinds import DECLARABLE, SCENE_PARAMETERS, Kind, kinds_of
-from jaxgran.fitting.parameters import Unknown, as_floats, domain_of, with_parameters
-from jaxgran.fitting.problem import Problem
+from jaxgran.fitting.parameters import as_floats, with_parameters
+from jaxgran.fitting.problem import Problem, unknown_of
 from jaxgran.fitting.profiles import (
     ALLOWED,
     ALLOWED_OVER_ALL,
@@ -31,6 +32,7 @@ from jaxgran.fitting.profiles import (
     trial_of,
     with_wider_rate_error,
 )
+from jaxgran.fitting.rows import WHITE
 from jaxgran.fitting.search import Minimum
 from jaxgran.scene.laws import VARIANT_SPEED
 
@@ -39,6 +41,9 @@ PREFERENCE_LEVEL = 0.01
 
 DISTINGUISHABLE_SHARE = 0.1
 """Relative change of an estimate below which an allowed alternative is negligible."""
+
+AND = ", and "
+"""Between the names of effects that are added together."""
 
 THEORY_TOLERANCE = 1e3
 """Factor of the tolerance of kinetic theory."""
@@ -50,18 +55,18 @@ class Alternative(NamedTuple):
     Attributes:
         name: description of the added element or error.
         effect: its name in ``absent`` of `jaxgran.Measurement`; "" for an error of the measurement.
-            Of two effects together it is the first one.
+            Of several effects together it is the first one that has such a name.
         amplitude: the best amplitude: the share of the initial cooling rate (walls, drag) or of
             the lowest computed T (floor), 1 + beta_t, 1/mu or mu (sliding), the relative error,
-            the standard deviation of eps, or the delay of the clock over the cooling time. Of two
-            effects together it is the amplitude of the second one.
+            the standard deviation of eps, or the delay of the clock over the cooling time. Of
+            several effects together it is the amplitude of the last one.
         allowed: the smallest and the largest amplitude that the data allow.
         improvement: decrease of -2 ln L from the fitted law to the best amplitude.
         estimate: estimate of the free parameters at the best amplitude, SI.
         low, high: range of each free parameter over the allowed amplitudes, SI, 95 %.
-        preferred: True if the data prefer this alternative to the fitted law, or two effects
-            together to the first of them; by chance they prefer any of the alternatives in 1 % of
-            fits.
+        preferred: True if the data prefer this alternative to the fitted law, or several effects
+            together to those without the last one; by chance they prefer any of the alternatives in
+            1 % of fits.
         distinguishable: True if the data allow so little of the alternative that it widens the
             range of the first parameter by less than 10 %.
         error_reduction_needed: factor by which the errors must decrease for that; 1 if it is
@@ -155,85 +160,119 @@ def compare_alternatives(
     profiles = {
         kind: [profile_of(problem, kind, base, base.flat) for base in bases] for kind in kinds
     }
-    first = _preferred_element(profiles, bases[0].value - significant)
-    pairs = {} if first is None else _pairs(problem, first, profiles[first], bases[0])
-    all_profiles = profiles | pairs
-    trials = [t for kind in all_profiles if kind.keeps_A for t in _trials(all_profiles[kind])]
+    stages = [_Stage(problem, bases[0], bases[0].flat, (), profiles)]
+    while (first := stages[-1].next_effect(significant)) is not None:
+        stage = _beside(stages[-1], first)
+        if stage is None:
+            break
+        stages.append(stage)
+    trials = [trial for stage in stages for trial in stage.trials()]
     best = min([*bases, *trials], key=lambda trial: trial.value)
     summary = _Summary(problem, bases[0], best, significant, noise)
-    law = summary.build(None, [[base] for base in bases])
-    singles = {kind: summary.build(kind, found, law) for kind, found in profiles.items()}
-    alternatives = [*singles.values()]
-    if first is not None:
-        alternatives += [summary.build(pair, x, singles[first]) for pair, x in pairs.items()]
+    law = summary.build((), [[base] for base in bases])
+    alternatives: list[Alternative] = []
+    beside = law
+    for number, stage in enumerate(stages):
+        built = {
+            kind: summary.build((*stage.shown, kind), found, beside)
+            for kind, found in stage.profiles.items()
+        }
+        alternatives += built.values()
+        if number + 1 < len(stages):
+            beside = built[stages[number + 1].shown[-1]]
     best_first = sorted(alternatives, key=lambda alternative: -alternative.improvement)
     return Explanations(law, tuple(best_first))
 
 
-def _trials(profiles: list[list[Trial]]) -> list[Trial]:
-    return [trial for profile in profiles for trial in profile]
+class _Stage(NamedTuple):
+    """Alternatives beside effects that the data show, whose amplitudes are unknowns.
+
+    Attributes:
+        problem: with these effects.
+        base: its fit.
+        origin: of all searches: the fitted law, with the first guesses of the amplitudes.
+        shown: the effects.
+        profiles: of each further effect, from each minimum.
+    """
+
+    problem: Problem
+    base: Trial
+    origin: np.ndarray
+    shown: tuple[Kind, ...]
+    profiles: dict[Kind, list[list[Trial]]]
+
+    def trials(self) -> list[Trial]:
+        """Return all trials in which A has a meaning."""
+        return [t for kind in self.profiles if kind.keeps_A for t in self.trials_of(kind)]
+
+    def trials_of(self, kind: Kind) -> list[Trial]:
+        """Return all trials of a kind of alternatives."""
+        return [trial for trials in self.profiles[kind] for trial in trials]
+
+    def best_of(self, kind: Kind) -> Trial:
+        """Return the best fit with a kind of alternatives."""
+        return min(self.trials_of(kind), key=lambda trial: trial.value)
+
+    def next_effect(self, significant: float) -> Kind | None:
+        """Return a further effect that the data show, None if there is none.
+
+        It is independent errors of T, if these would exclude other effects, or the alternative that
+        fits best if it is the first element of the scene to be shown.
+
+        Args:
+            significant: decrease of -2 ln L from which an element is shown.
+        """
+        known = [kind for kind in self.profiles if kind.keeps_A]
+        if not known:
+            return None
+        for kind in known:
+            if kind.parameters == (WHITE,) and self._gain(kind) > ALLOWED_OVER_ALL:
+                return kind
+        first = min(known, key=lambda kind: self.best_of(kind).value)
+        is_first_element = _is_element(first) and not any(map(_is_element, self.shown))
+        return first if is_first_element and self._gain(first) > significant else None
+
+    def _gain(self, kind: Kind) -> float:
+        return self.base.value - self.best_of(kind).value
 
 
-def _preferred_element(profiles: dict[Kind, list[list[Trial]]], limit: float) -> Kind | None:
-    """Return the alternative of least -2 ln L, if it adds an element and is below a limit."""
-    known = [kind for kind in profiles if kind.keeps_A]
-    if not known:
-        return None
-
-    def least(kind: Kind) -> float:
-        return min(trial.value for trial in _trials(profiles[kind]))
-
-    first = min(known, key=least)
-    is_element = first.parameters[0] in SCENE_PARAMETERS
-    return first if is_element and least(first) < limit else None
+def _is_element(kind: Kind) -> bool:
+    return kind.parameters[0] in SCENE_PARAMETERS
 
 
-def _pairs(
-    problem: Problem,
-    first: Kind,
-    profiles: list[list[Trial]],
-    law: Trial,
-) -> dict[Kind, list[list[Trial]]]:
-    """Return profiles of second effects beside an element, whose amplitude is an unknown.
+def _beside(stage: _Stage, first: Kind) -> _Stage | None:
+    """Return the alternatives beside one more effect; None if it cannot be fitted.
 
     Args:
-        problem: see `compare_alternatives`.
-        first: the element.
-        profiles: of the element alone.
-        law: the fit without it.
+        stage: in which the effect was found.
+        first: the effect.
     """
-    at_best = min(_trials(profiles), key=lambda trial: trial.value)
-    problem, base, origin = _with_free_amplitude(problem, first, at_best, law)
+    problem = stage.problem
+    at_best = stage.best_of(first)
+    name = first.parameters[0]
+    values = first.values_by_label(problem, at_best.amplitude)
+    guesses = {label: own.pop(name) for label, own in values.items()}
+    labels = list(first.curves)
+    gases = {m.label: m.gas for m in problem.curves}
+    if first.changes_law:  # drop tests have the law of impacts, too
+        unknowns = [unknown_of(name, None, gases[labels[0]], problem.curves)]
+    else:
+        unknowns = [unknown_of(name, x, gases[x], problem.curves) for x in labels]
+    start = [u.domain.to_free(guesses[x]) / u.unit for u, x in zip(unknowns, labels, strict=False)]
+    changed = with_wider_rate_error(problem, first.rate_error(at_best.amplitude))
+    fixed = {
+        label: problem.fixed.get(label, {}) | values.get(label, {})
+        for label in {*problem.fixed, *values}
+    }
+    both = replace(changed, unknowns=(*problem.unknowns, *unknowns), fixed=fixed)
+    origin = np.append(stage.origin, start)
+    base = trial_of(both, 0.0, np.append(at_best.flat, start), origin)
     if base is None:
-        return {}
-    found = {}
-    for second in kinds_of(problem, base.flat):
-        if second.keeps_A:
-            pair = replace(
-                second,
-                name=f"{first.name}, and {second.name}",
-                parameters=(*first.parameters, *second.parameters),
-            )
-            found[pair] = [profile_of(problem, second, base, origin)]
-    return found
-
-
-def _with_free_amplitude(
-    problem: Problem, kind: Kind, at_best: Trial, law: Trial
-) -> tuple[Problem, Trial | None, np.ndarray]:
-    """Return the problem with an element whose amplitude is an unknown, its fit, and its origin."""
-    name = kind.parameters[0]
-    values = kind.values_by_label(problem, at_best.amplitude)
-    first = [own.pop(name) for own in values.values()]
-    domain = domain_of(next(m.gas for m in problem.curves if m.label in kind.curves), name)
-    # Drop tests have the law of impacts, too; other elements belong to each curve.
-    labels = [None] if kind.changes_law else list(kind.curves)
-    unknowns = [Unknown(name, label, (), domain) for label in labels]
-    start = [domain.to_free(x) for x in first[: len(labels)]]
-    changed = with_wider_rate_error(problem, kind.rate_error(at_best.amplitude))
-    both = replace(changed, unknowns=(*problem.unknowns, *unknowns), fixed=values)
-    origin = np.append(law.flat, start)
-    return both, trial_of(both, 0.0, np.append(at_best.flat, start), origin), origin
+        return None
+    profiles = {
+        second: [profile_of(both, second, base, origin)] for second in kinds_of(both, base.flat)
+    }
+    return _Stage(both, base, origin, (*stage.shown, first), profiles)
 
 
 class _Allowed(NamedTuple):
@@ -259,15 +298,20 @@ class _Summary(NamedTuple):
     noise: Float[np.ndarray, "p"]
 
     def build(
-        self, kind: Kind | None, profiles: list[list[Trial]], beside: Alternative | None = None
+        self,
+        effects: tuple[Kind, ...],
+        profiles: list[list[Trial]],
+        beside: Alternative | None = None,
     ) -> Alternative:
         """Return an alternative from its trials, interpolated between the amplitudes.
 
         Args:
-            kind: of the alternative; None for the law itself.
+            effects: what the alternative adds; the amplitude of the last one is varied. () for the
+                law itself.
             profiles: the trials, from each minimum.
-            beside: what it is added to: the law, or an element; None for the law itself.
+            beside: the same without the last effect; None for the law itself.
         """
+        kind = effects[-1] if effects else None
         # The law without an alternative is not a trial of one that has no amplitudes in between.
         ends = [trials if kind is None or kind.keeps_A else trials[1:] for trials in profiles]
         best = min((t for trials in ends for t in trials), key=lambda t: t.value, default=self.base)
@@ -282,7 +326,8 @@ class _Summary(NamedTuple):
         if beside is not None:
             beyond = max(beside.low[0] - low[0], high[0] - beside.high[0])
             wider = beyond / abs(beside.estimate[0])
-        parameter = "" if kind is None else kind.parameters[0]
+        known = {parameter: name for name, (parameter, _) in DECLARABLE.items()}
+        names = [known[x.parameters[0]] for x in effects if x.parameters[0] in known]
         improvement = self.base.value - best.value
         gained = improvement if beside is None else improvement - beside.improvement
         restitution = None
@@ -292,8 +337,8 @@ class _Summary(NamedTuple):
             high = beside.high
             restitution = constant_restitution(self.problem, best)
         return Alternative(
-            name="" if kind is None else kind.name,
-            effect=next((name for name, x in DECLARABLE.items() if x[0] == parameter), ""),
+            name=AND.join(x.name for x in effects),
+            effect=names[0] if names else "",
             amplitude=best.amplitude,
             allowed=(float(np.min(allowed.amplitude)), float(np.max(allowed.amplitude))),
             improvement=float(improvement),

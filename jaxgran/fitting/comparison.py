@@ -19,13 +19,6 @@ from jaxgran.fitting.prediction import Element, PredictedCurve, Prediction
 from jaxgran.fitting.rows import DISPLACEMENT, Displacement, Noise, Observed
 from jaxgran.scene.gas import Gas
 
-FLOOR = "floor"
-"""Noise floor, m^2/s^2, added to the computed T: a parameter of an alternative explanation."""
-
-WHITE = "white"
-"""Relative standard deviation of further independent errors of T: a parameter of an alternative
-explanation, too."""
-
 DIFFERENCE = float(np.finfo(float).eps ** 0.25)
 """Step of central differences in an unconstrained parameter."""
 
@@ -155,10 +148,9 @@ class Comparison:
             return np.asarray(x)[..., None] + slopes @ steps
 
         batch: Prediction = jax.tree.map(with_neighbours, curve.prediction, *tangents)
-        floor = float(curve.values.get(FLOOR, 0.0))
         T = np.exp(batch.compared[:, 0])
         compared = batch.compared.copy()
-        compared[:, 0] = np.log(T + floor)
+        compared[:, 0] = np.log(T + batch.floor)
         parameters = {name: np.moveaxis(x, -1, 0) for name, x in batch.parameters.items()}
         gas = with_parameters(curve.rows.gases(gases), parameters)
         compiled = fast_jit(innovations, jax.default_backend())
@@ -166,9 +158,9 @@ class Comparison:
             gas,
             _nodes(curve, batch, gas),
             compared,
-            T / (T + floor),
+            T / (T + batch.floor),
             self._observed(),
-            self._noise(batch.scatter),
+            self._noise(batch.scatter, batch.white),
         )
 
         def of_data(x: Any) -> np.ndarray:
@@ -188,11 +180,10 @@ class Comparison:
         simulation = self.sources.get("simulation", 1.0) * observed.simulation
         return observed._replace(simulation=simulation)
 
-    def _noise(self, log_scatter: Any) -> Noise:
+    def _noise(self, log_scatter: Any, white: Any = 0.0) -> Noise:
         curve = self.curve
         few_particles = self.sources.get("few particles", 1.0)
         of_number = few_particles * np.exp(log_scatter)
-        white = float(curve.values.get(WHITE, 0.0))
         factor = self.sources.get("model", 1.0) ** 0.5
         noise = curve.rows.noise(curve.times, of_number, white, factor)
         return noise._replace(sample=self.sources.get("sampling", 1.0) * noise.sample)

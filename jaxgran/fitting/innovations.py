@@ -171,13 +171,13 @@ def innovations(
         log_computed: ln T and ln T_rot with which the measured values are compared.
         sensitivity: derivative of the computed ln T in ln T of the gas: 1 without a noise floor.
         observed: the measured values.
-        noise: what makes them scatter; its `inverse_number` has the shape (gases,).
+        noise: what makes them scatter; its `inverse_number` and `white` have the shape (gases,).
     """
     values = observed.values[..., None]
     errors = observed.errors[..., None]
     residuals = log_ratio(values, log_computed, errors)
     variances = (errors / jnp.exp(log_computed)) ** 2 + observed.simulation[..., None]
-    variances = variances.at[:, 0].add(noise.white**2)
+    variances = variances.at[:, 0].add(noise.white[None] ** 2)
     found, spread = filtered(
         gas, nodes, residuals[:, :, None], variances, sensitivity, observed.used, noise
     )

@@ -218,6 +218,7 @@ def _likelihood_of_displacement(
     collisions = nodes.collisions[place]
     diffusive = collisions / (1 + collisions)
     known = jnp.where(measured.used, computed.displacement[place], 1.0)
-    columns = measured.whitening @ jnp.stack([measured.logs - jnp.log(known), diffusive], axis=-1)
+    columns = jnp.stack([measured.logs - jnp.log(known), diffusive], axis=-1)
+    columns = jnp.asarray(measured.whitening) @ columns
     weights = jnp.ones(measured.logs.shape)
     return -0.5 * _without_factors(columns, weights, jnp.asarray([measured.accuracy]))

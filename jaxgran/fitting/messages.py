@@ -11,7 +11,7 @@ import numpy as np
 import scipy  # which imports scipy.stats at its first use
 
 from jaxgran.data.drop_test import DropTest
-from jaxgran.fitting.alternatives import DISTINGUISHABLE_SHARE, Alternative, Explanations
+from jaxgran.fitting.alternatives import AND, DISTINGUISHABLE_SHARE, Alternative, Explanations
 from jaxgran.fitting.goodness import SIGNIFICANCE
 from jaxgran.fitting.kinds import DECLARABLE
 from jaxgran.fitting.result import CONDITIONAL, Fit
@@ -299,7 +299,8 @@ def _verdict(result: Fit, is_misfit: bool, limitations: tuple[Limitation, ...]) 
         span = _range(result, low, high)
         if not possible and not (low >= 0 and high > MAX_RATIO * low):
             return DETERMINED, say("determined", range=span, **words)
-        why = say("possible", name=possible[0], range=span) if possible else span
+        simplest = min(possible, key=lambda name: name.count(AND), default=None)
+        why = span if simplest is None else say("possible", name=simplest, range=span)
     return NOT_DETERMINED, say("not determined", why=why, **words)
 
 

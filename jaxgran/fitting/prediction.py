@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from jaxgran._utils.tracing import grid_size
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.parameters import as_floats, power_of_line, with_parameters
-from jaxgran.fitting.rows import CALIBRATION, ROTATION, SCATTER, CurveRows
+from jaxgran.fitting.rows import CALIBRATION, FLOOR, ROTATION, SCATTER, WHITE, CurveRows
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.linearise import LinearisedCurve, linearise
 from jaxgran.scene.gas import Gas
@@ -62,6 +62,8 @@ class Prediction(NamedTuple):
         parameters: of the gas, by name.
         size_ratio: q of spheres of unequal sizes, shape (nodes,); None for equal spheres.
         scatter: logarithm of the scatter of N grains over what theory gives.
+        floor: what is added to the computed T, m^2/s^2.
+        white: relative standard deviation of further independent errors of T.
     """
 
     log_T: np.ndarray
@@ -72,6 +74,8 @@ class Prediction(NamedTuple):
     parameters: dict[str, np.ndarray]
     size_ratio: np.ndarray | None = None
     scatter: float = 0.0
+    floor: float = 0.0
+    white: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -176,6 +180,8 @@ class _ExpandedCurve:
             parameters=as_floats({name: values[name] for name in names}),
             size_ratio=self.size_ratio,
             scatter=values.get(SCATTER, 0.0),
+            floor=values.get(FLOOR, 0.0),
+            white=values.get(WHITE, 0.0),
         )
 
     def tangent(self, element: Element, prediction: Prediction) -> Prediction:
@@ -200,6 +206,7 @@ class _ExpandedCurve:
         of_logs = np.stack([of_measured, of_rotation], axis=1)
         factors = {ROTATION: np.array([0.0, 1.0]), CALIBRATION: np.ones(2)}
         of_factors = element.slope * factors.get(element.name, np.zeros(2))
+        own_slope = {element.name: element.slope}
         of_parameters = {name: np.zeros_like(x) for name, x in prediction.parameters.items()}
         if element.name in of_parameters:
             of_parameters[element.name].flat[element.number] = element.slope
@@ -211,7 +218,9 @@ class _ExpandedCurve:
             displacement=change_of_log("displacement"),
             parameters=of_parameters,
             size_ratio=of_size_ratio,
-            scatter=element.slope if element.name == SCATTER else 0.0,
+            scatter=own_slope.get(SCATTER, 0.0),
+            floor=own_slope.get(FLOOR, 0.0),
+            white=own_slope.get(WHITE, 0.0),
         )
 
     def _slopes(self, element: Element) -> dict[str, np.ndarray]:

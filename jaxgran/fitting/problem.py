@@ -1,5 +1,6 @@
 """The problem of a fit: measurements, unknowns, and -2 ln L with its derivatives."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -7,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxgran._utils.validation import Domain
+from jaxgran._utils.validation import POSITIVE, Domain
 from jaxgran.data.drop_test import SPHERE
 from jaxgran.data.measurement import START_TIME, Priors
 from jaxgran.fitting.comparison import Comparison, Residuals
@@ -21,7 +22,7 @@ from jaxgran.fitting.parameters import (
     residuals_and_slopes,
 )
 from jaxgran.fitting.prediction import Element, PredictedCurve, predicted_curve, steady_curve
-from jaxgran.fitting.rows import CurveRows, DropRows
+from jaxgran.fitting.rows import FLOOR, WHITE, CurveRows, DropRows
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import Gas
 
@@ -106,11 +107,7 @@ class Problem:
         gas = measurements[0].gas
 
         def unknown(name: str, label: str | None, gas: Gas) -> Unknown:
-            domain = domain_of(gas, name)
-            if name != START_TIME:
-                return Unknown(name, label, jnp.shape(gas.value(name)), domain)
-            unit = halving_time(next(m.curve for m in curves if label in (None, m.label)))
-            return Unknown(name, label, (), domain, float(unit))
+            return unknown_of(name, label, gas, curves)
 
         unknowns = [unknown(name, None, gas) for name in free]
         unknowns += [unknown(name, m.label, m.gas) for name in separate for m in curves]
@@ -285,6 +282,24 @@ class Problem:
             curve = predicted_curve(m, self.simplified_model, values, applied, self.tolerance)
             self._curves[m.label] = flat.tobytes(), curve
         return curve
+
+
+def unknown_of(name: str, label: str | None, gas: Gas, curves: Iterable[CurveRows]) -> Unknown:
+    """Return a parameter, of the measurement with a label or of all, as an unknown.
+
+    Args:
+        name: of a parameter of a gas, t0, or an error of T.
+        label: of the measurement; None if all share it.
+        gas: of the measurement.
+        curves: all measured curves.
+    """
+    if name in (FLOOR, WHITE):
+        return Unknown(name, label, (), POSITIVE)
+    domain = domain_of(gas, name)
+    if name != START_TIME:
+        return Unknown(name, label, jnp.shape(gas.value(name)), domain)
+    unit = halving_time(next(m.curve for m in curves if label in (None, m.label)))
+    return Unknown(name, label, (), domain, float(unit))
 
 
 class _ComparedImpacts(NamedTuple):

@@ -28,6 +28,13 @@ ROTATION = "model of T_rot"
 DISPLACEMENT = "model of <dr^2>"
 """The same of the diffusive part of <dr^2>."""
 
+FLOOR = "floor"
+"""Noise floor, m^2/s^2, added to the computed T: a parameter of an alternative explanation."""
+
+WHITE = "white"
+"""Relative standard deviation of further independent errors of T: a parameter of an alternative
+explanation, too."""
+
 CALIBRATION = "calibration"
 """The logarithm of a common factor of all measured T and T_rot."""
 
@@ -77,7 +84,7 @@ class Noise(NamedTuple):
         first: variance of ln T at t = 0 over `inverse_number`: 0 where T_0 is the run's own.
         rate_error: relative standard error of theory's cooling rate at the nodes, shape (nodes,).
         sample: variance of ln T by the sampling of some of the grains.
-        white: relative standard deviation of further errors, independent at each time.
+        white: relative standard deviation of further errors of T, independent at each time.
     """
 
     inverse_number: Any
@@ -197,9 +204,7 @@ class CurveRows:
             among(self.simulation, 0.0),
         )
 
-    def noise(
-        self, times: np.ndarray, factor: Any, white: float = 0.0, model: float = 1.0
-    ) -> Noise:
+    def noise(self, times: np.ndarray, factor: Any, white: Any = 0.0, model: float = 1.0) -> Noise:
         """Return what makes the values scatter.
 
         Args:

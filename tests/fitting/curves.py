@@ -4,12 +4,14 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import jaxgran
 from tests.beads import glass_beads
 
 A = "dissipative_constant"
 BOTH = (A, "temperature")
+NUM_PARTICLES = 250
 
 
 def synthetic(
@@ -34,6 +36,25 @@ def synthetic(
             fields[name] = value * jnp.exp(along * relative_error)
             fields[f"{name}_error"] = relative_error * value
     return jaxgran.CoolingCurve(times, **fields)
+
+
+def drawn(gas, error, rng):
+    """A run of `NUM_PARTICLES` grains: its curve, its residuals, and their covariance by theory."""
+    times = np.geomspace(0.3, 60, 25) * float(gas.mean_free_time)
+    rotation = gas.surface is not None
+    exact = jaxgran.cool(gas, times)
+    covariance = np.asarray(
+        jaxgran.KineticTheory().covariance(gas, times, NUM_PARTICLES, rotation=rotation)
+    )
+    covariance = covariance + np.diag(np.full(len(covariance), error**2 + 1e-14))
+    residuals = np.linalg.cholesky(covariance) @ rng.normal(size=len(covariance))
+    fields = {"temperature": exact.temperature * np.exp(residuals[:25])}
+    if rotation:
+        fields["rotational_temperature"] = exact.rotational_temperature * np.exp(residuals[25:])
+    if error > 0:
+        names = tuple(fields)
+        fields |= {f"{name}_error": error * getattr(exact, name) for name in names}
+    return jaxgran.CoolingCurve(times, **fields), residuals, covariance
 
 
 def cooled_beads(seed=0, **options):

@@ -16,9 +16,11 @@ from jaxgran.scene.laws import ViscoelasticVariant
 from tests.beads import glass_beads
 from tests.fitting.curves import (
     BOTH,
+    NUM_PARTICLES,
     A,
     cooled_beads,
     deviation,
+    drawn,
     fitted,
     in_range,
     synthetic,
@@ -210,6 +212,21 @@ def test_the_range_holds_A_where_two_elements_are_not_told(elements, first, seco
     assert both.improvement >= alone.improvement - 3.84 and in_range(result, gas.value(A))
     assert any(f"{first}, and {second} cannot be excluded" in x for x in result.reasons)
     assert f"with {first}, in which A = {alone.estimate[0]:.3g} s." in result.verdict
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("error", [0.005, 0.02])
+def test_the_range_holds_A_where_walls_and_errors_of_T_are_not_told(error):
+    """Beside independent errors of T, without which nothing fits, other effects stay possible."""
+    gas = glass_beads(0.1)
+    walls = jaxgran.Walls(gas.box_side(NUM_PARTICLES), restitution=0.9)
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        curve, *_ = drawn(dataclasses.replace(gas, container=walls), 0.0, rng)
+        noise = np.exp(error * rng.normal(size=curve.times.size))
+        curve = dataclasses.replace(curve, temperature=noise * curve.temperature)
+        result = jaxgran.fit(jaxgran.Measurement(gas, curve, num_particles=NUM_PARTICLES))
+        assert in_range(result, gas.value(A))
 
 
 @pytest.mark.slow

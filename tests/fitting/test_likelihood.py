@@ -16,10 +16,9 @@ from jaxgran.fitting.rows import Noise
 from jaxgran.fitting.search import minimise
 from jaxgran.fitting.setup import Request, build_problem, problem_with_rate_errors
 from tests.beads import glass_beads
-from tests.fitting.curves import A, cooled_beads
+from tests.fitting.curves import NUM_PARTICLES, A, cooled_beads, drawn
 
 THEORY = jaxgran.KineticTheory()
-NUM_PARTICLES = 250
 ROUGH = jaxgran.Rough(0.2, rotational_temperature=3e-3)
 WALLS = jaxgran.Walls(0.05, restitution=0.9)
 
@@ -30,23 +29,6 @@ SCENES = {
     "rough between walls": ({"surface": ROUGH, "container": WALLS}, 0.01),
     "driven": ({"drive": jaxgran.WhiteNoise(1e-2)}, 0.0),
 }
-
-
-def drawn(gas, error, rng):
-    """A run of the covariance of theory: its curve, its residuals, and their covariance."""
-    times = np.geomspace(0.3, 60, 25) * float(gas.mean_free_time)
-    rotation = gas.surface is not None
-    exact = jaxgran.cool(gas, times)
-    covariance = np.asarray(THEORY.covariance(gas, times, NUM_PARTICLES, rotation=rotation))
-    covariance = covariance + np.diag(np.full(len(covariance), error**2 + 1e-14))
-    residuals = np.linalg.cholesky(covariance) @ rng.normal(size=len(covariance))
-    fields = {"temperature": exact.temperature * np.exp(residuals[:25])}
-    if rotation:
-        fields["rotational_temperature"] = exact.rotational_temperature * np.exp(residuals[25:])
-    if error > 0:
-        names = tuple(fields)
-        fields |= {f"{name}_error": error * getattr(exact, name) for name in names}
-    return jaxgran.CoolingCurve(times, **fields), residuals, covariance
 
 
 @pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow) for x in SCENES])

@@ -33,7 +33,7 @@ def test_a_value_that_is_not_used_is_no_outlier():
     measurement = jaxgran.Measurement(GAS, curve, num_particles=2000)
     names = ("dissipative_constant",)
     theory = jaxgran.KineticTheory()
-    request = Request({"": measurement}, theory, names, (), {}, None, (), quick=True)
+    request = Request({"": measurement}, theory, names, (), {}, None, quick=True)
     problem, _, _ = build_problem(request)
     assert _predecessor(problem, Value("", 1, 0)) == []
     assert _predecessor(problem, Value("", 2, 0)) == [Value("", 1, 0)]

@@ -13,9 +13,7 @@ from tests.fitting.curves import BOTH, A, cooled_beads
 def test_a_search_stays_in_its_region_and_fits_the_other_unknowns_there(beyond):
     gas, curve = cooled_beads()
     measurement = jaxgran.Measurement(gas, curve, num_particles=1000)
-    request = Request(
-        {"": measurement}, jaxgran.KineticTheory(), BOTH, (), {}, None, (), quick=True
-    )
+    request = Request({"": measurement}, jaxgran.KineticTheory(), BOTH, (), {}, None, quick=True)
     problem, first, _ = build_problem(request)
     free = minimise(problem, first, 100)
     # The best A is a factor e below the region; the search begins at its edge, or outside.
