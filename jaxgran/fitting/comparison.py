@@ -57,8 +57,8 @@ class Comparison:
 
     Attributes:
         curve: the predicted curve, with the measurement.
-        sources: factors of the variances by "measurement", "few particles", "sampling",
-            "model" and "simulation"; 1 by default.
+        sources: factors of the variances by "measurement", which includes independent errors that
+            a fit finds, "few particles", "sampling", "model" and "simulation"; 1 by default.
     """
 
     curve: PredictedCurve
@@ -160,7 +160,7 @@ class Comparison:
             compared,
             T / (T + batch.floor),
             self._observed(),
-            self._noise(batch.scatter, batch.white),
+            self._noise(batch.scatter, self._error_factor * batch.white),
         )
 
         def of_data(x: Any) -> np.ndarray:
@@ -173,10 +173,14 @@ class Comparison:
             np.where(used, of_data(found.density_changes), 0.0),
         )
 
+    @property
+    def _error_factor(self) -> float:
+        """Factor of the errors of the measurement."""
+        return self.sources.get("measurement", 1.0) ** 0.5
+
     def _observed(self) -> Observed:
         curve = self.curve
-        factor = self.sources.get("measurement", 1.0) ** 0.5
-        observed = curve.rows.at_nodes(curve.times.size, curve.place, factor)
+        observed = curve.rows.at_nodes(curve.times.size, curve.place, self._error_factor)
         simulation = self.sources.get("simulation", 1.0) * observed.simulation
         return observed._replace(simulation=simulation)
 

@@ -1,6 +1,7 @@
 """The estimate of a fit and its result."""
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,9 +26,10 @@ from jaxgran.fitting.messages import say, with_words
 from jaxgran.fitting.outliers import without_outliers
 from jaxgran.fitting.parameters import as_floats, with_parameters
 from jaxgran.fitting.prediction import TINY
-from jaxgran.fitting.problem import Evaluation, Problem
+from jaxgran.fitting.problem import Evaluation, Problem, unknown_of
+from jaxgran.fitting.profiles import ALLOWED
 from jaxgran.fitting.result import Fit
-from jaxgran.fitting.rows import SCATTER, CurveRows
+from jaxgran.fitting.rows import SCATTER, WHITE, CurveRows, has_no_measured_errors
 from jaxgran.fitting.search import Descent, Minimum, best_of_starts, minimise
 from jaxgran.fitting.setup import Request, build_problem, problem_with_rate_errors
 from jaxgran.models.checks import describe_walls
@@ -46,6 +48,13 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
         best, minima = best_of_starts(problem, first, max_steps, descent)
     check_computed(problem, best)
     explanations = None
+    told = problem
+    of_law = goodness(told, told.evaluate(best.flat))
+    if descent is None and (of_law["p_value"] < SIGNIFICANCE or not best.converged):
+        has_ended = best.converged
+        problem, best, minima = _with_errors_of_T(problem, first, best, minima, max_steps)
+        if not has_ended:
+            of_law = goodness(told, told.evaluate(best.flat[: first.size]))
     distant = distant_curves(problem, problem.evaluate(best.flat))
     if distant:
         notes = [*notes, say("distant", ratio=MAX_DISTANCE)]
@@ -53,15 +62,57 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
         is_driven = any(m.scene.drive is not None for m in problem.curves)
         noise = np.zeros(problem.num_free)
         explanations = compare_alternatives(problem, minima, noise, is_driven)
-    result = assembled(request, problem, best, minima, explanations)
+    if not distant:
+        notes = [*notes, *_errors_of_T(problem, best)]
+    result = replace(assembled(request, problem, best, minima, explanations), **of_law)
     share = measurement_share(problem, problem.evaluate(best.flat))
     if result.p_value < SIGNIFICANCE and not request.quick and not distant:
-        notes += _outlier_notes(problem, first, max_steps)
+        notes += _outlier_notes(told, first, max_steps)
     scatter = problem.evaluate(best.flat).scatter_of_eps
     if scatter is not None:
         notes = [*notes, say("scatter of eps", scatter=scatter)]
     return with_messages(request, result, explanations, notes, share)
 
+
+def _with_errors_of_T(
+    problem: Problem, first: np.ndarray, best: Minimum, minima: list[Minimum], max_steps: int
+) -> tuple[Problem, Minimum, list[Minimum]]:
+    """Return the problem with independent errors of T that the data show, and its minima.
+
+    Where a curve scatters more than its grains can, and has no errors, the estimates would follow
+    its noise. Without such a curve, or errors, the problem and its minima are returned.
+    """
+    bare = [m for m in problem.curves if has_no_measured_errors(m)]
+    if not bare:
+        return problem, best, minima
+    computed = problem.evaluate(first).curves
+    unknowns = [unknown_of(WHITE, m.label, m.scene, problem.curves) for m in bare]
+    sizes = [_roughness(m, computed[m.label]["temperature"]) for m in bare]
+    wider = replace(problem, unknowns=(*problem.unknowns, *unknowns))
+    wider, end, others = _found_by_two_searches(wider, np.append(first, np.log(sizes)), max_steps)
+    if end.value > best.value - ALLOWED or not end.converged:
+        return problem, best, minima
+    return wider, end, others
+
+
+def _roughness(m: CurveRows, computed: np.ndarray) -> float:
+    """Return the standard deviation of ln T about a smooth curve, from second differences."""
+    used = (m.used[:, 0] > 0) & (m.values[:, 0] > 0)
+    residuals = np.log(m.values[used, 0] / computed[used])
+    second = np.diff(residuals, 2)
+    return float(np.clip(np.sqrt(np.mean(second**2) / 6), *ROUGHNESS_LIMITS))
+
+
+def _errors_of_T(problem: Problem, best: Minimum) -> Iterator[str]:
+    """Yield a clause on the errors of T that a fit found in curves without errors."""
+    for unknown, value in problem.parts(best.flat):
+        if unknown.name == WHITE:
+            prefix = f"{unknown.label}: " if unknown.label else ""
+            yield prefix + say("errors of T", percent=100 * float(value))
+
+
+ROUGHNESS_LIMITS = (1e-4, 1.0)
+"""Range of the first guess of independent errors of T; less than two differences give the first."""
 
 MAX_DISTANCE = 3.0
 """Factor between measured and fitted T. If `DISTANT_SHARE` of the values differ by more, the scale

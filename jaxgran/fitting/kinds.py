@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.problem import Problem
-from jaxgran.fitting.rows import BEYOND_ROUNDING, FLOOR, WHITE, CurveRows, rounding_errors
+from jaxgran.fitting.rows import FLOOR, WHITE, CurveRows, has_no_measured_errors
 from jaxgran.models.error_model import ROUGHNESS_ERROR, SLIDING_ERROR
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.laws import VISCOELASTIC_EXPONENT
@@ -143,9 +143,8 @@ def _start_is_known(rows: CurveRows, unknowns: set[str]) -> bool:
     return unknowns.isdisjoint({START_TIME, "temperature"})
 
 
-def _has_no_measured_errors(rows: CurveRows, unknowns: set[str]) -> bool:
-    rounding = rounding_errors(rows.measurement)
-    return not np.any(rows.errors[:, 0] > BEYOND_ROUNDING * rounding[:, 0])
+def _has_no_errors(rows: CurveRows, unknowns: set[str]) -> bool:
+    return has_no_measured_errors(rows)
 
 
 KINDS = (
@@ -173,7 +172,7 @@ KINDS = (
         parameters=(WHITE,),
         amplitudes=(WHITE_ERRORS,),
         values=lambda error, curve: {WHITE: error},
-        applies=_has_no_measured_errors,
+        applies=_has_no_errors,
     ),
     Kind(
         name=ROUGHNESS_ADDED,

@@ -108,6 +108,8 @@ MESSAGES = {
     "{factor:g} times smaller",
     "outliers": "far outliers at {places}: check them and their error bars",
     "without outliers": "; without them {symbol} is {value:.3g} +- {error:.2g}",
+    "errors of T": "T scatters by {percent:.2g} % more than its grains can: taken for independent "
+    "errors of T, beside which all else is fitted. Give T_err if they are known",
     "distant": "nearly every T differs from the fitted one by more than a factor of {ratio:g}: "
     "alternatives were not compared; check the units, the scale of T and T0",
     "max_steps": "the search did not converge: free fewer parameters, or in Python increase "

@@ -345,3 +345,9 @@ def rounding_errors(measurement: Measurement) -> Float[np.ndarray, "times 2"]:
     names = ("temperature", "rotational_temperature")
     each = [np.broadcast_to(np.asarray(digits.get(name, 0.0)), times) for name in names]
     return np.stack(each, axis=1) / 12**0.5
+
+
+def has_no_measured_errors(rows: CurveRows) -> bool:
+    """Tell whether no T of a curve has an error beyond its rounding."""
+    rounding = rounding_errors(rows.measurement)[:, 0]
+    return not np.any(rows.errors[:, 0] > BEYOND_ROUNDING * rounding)

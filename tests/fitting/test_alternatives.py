@@ -229,6 +229,22 @@ def test_the_range_holds_A_where_walls_and_errors_of_T_are_not_told(error):
         assert in_range(result, gas.value(A))
 
 
+@pytest.mark.parametrize("num_particles", [10**4, slow(10**8)])
+def test_errors_of_T_that_are_not_told_do_not_move_the_estimate(num_particles):
+    """Without T_err, and far above the scatter of N grains, they are found, and said."""
+    gas = glass_beads(0.1)
+    curve = synthetic(gas, jax.random.key(1), relative_error=0.05)
+    bare = dataclasses.replace(curve, temperature_error=None)
+    measurement = jaxgran.Measurement(gas, bare, num_particles=num_particles)
+    result = jaxgran.fit(measurement, free=BOTH)
+    assert result.converged and result.grade == "not consistent"
+    assert deviation(result, gas) < 3 and result.standard_error[0] < 0.05 * gas.value(A)
+    assert in_range(result, gas.value(A))
+    assert any(re.search(r"T scatters by (4|5)[.\d]* % more", x) for x in result.reasons)
+    told = fitted(gas, curve, free=BOTH, num_particles=num_particles)
+    assert float(told.standard_error[0]) == pytest.approx(float(result.standard_error[0]), rel=0.2)
+
+
 @pytest.mark.slow
 def test_the_range_has_an_upper_end_where_walls_take_all_energy():
     # A can be any small number, and a search must not follow it to values without information.
