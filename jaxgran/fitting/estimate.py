@@ -62,8 +62,6 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
         is_driven = any(m.scene.drive is not None for m in problem.curves)
         noise = np.zeros(problem.num_free)
         explanations = compare_alternatives(problem, minima, noise, is_driven)
-    if not distant:
-        notes = [*notes, *_errors_of_T(problem, best)]
     result = replace(assembled(request, problem, best, minima, explanations), **of_law)
     share = measurement_share(problem, problem.evaluate(best.flat))
     if result.p_value < SIGNIFICANCE and not request.quick and not distant:
@@ -101,14 +99,6 @@ def _roughness(m: CurveRows, computed: np.ndarray) -> float:
     residuals = np.log(m.values[used, 0] / computed[used])
     second = np.diff(residuals, 2)
     return float(np.clip(np.sqrt(np.mean(second**2) / 6), *ROUGHNESS_LIMITS))
-
-
-def _errors_of_T(problem: Problem, best: Minimum) -> Iterator[str]:
-    """Yield a clause on the errors of T that a fit found in curves without errors."""
-    for unknown, value in problem.parts(best.flat):
-        if unknown.name == WHITE:
-            prefix = f"{unknown.label}: " if unknown.label else ""
-            yield prefix + say("errors of T", percent=100 * float(value))
 
 
 ROUGHNESS_LIMITS = (1e-4, 1.0)
@@ -248,6 +238,9 @@ def assembled(
         for e in elements
         if e.name == SCATTER
     }
+    errors_of_T = {
+        u.label or "": float(error) for u, error in problem.parts(end.flat) if u.name == WHITE
+    }
     return Fit(
         names=names,
         model=problem.model,
@@ -263,6 +256,7 @@ def assembled(
         log_likelihood=-0.5 * found.value,
         residuals=_residuals(problem, found),
         scatter=scatter,
+        errors_of_T=errors_of_T,
         scales={m.label: describe_gas(gases[m.label], m) for m in problem.curves},
         start_time={m.label: float(values[m.label].get(START_TIME, 0.0)) for m in problem.curves},
         weights=weights_of_measurements(problem, found),

@@ -11,10 +11,10 @@ from jaxtyping import Float, PRNGKeyArray
 from tqdm import tqdm
 
 from jaxgran._utils.formatting import text_table
-from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran._utils.validation import check_bool, checked_int
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.measurement import START_TIME, Measurement
+from jaxgran.fitting.drawn_errors import imitations
 from jaxgran.fitting.fit import fit
 from jaxgran.fitting.result import CONDITIONAL, Fit
 from jaxgran.fitting.twins import AS_GIVEN, Truth, strongest_effect
@@ -124,11 +124,11 @@ def imitate(
 ) -> Imitation:
     """Simulate the fitted scene many times, fit each run, and count how often the range holds.
 
-    Each run has the times, N, number of runs and errors of the measurement, and is fitted by
-    kinetic theory with its priors and declared absences. The same is done with the alternative that
-    widens the range most as the truth, at half of its largest allowed amplitude; if the data prefer
-    one, at its own amplitude and estimate. Contacts of the runs have no duration; <dr^2> is left
-    out.
+    Each run has the times, N, number of runs and errors of the measurement, of the scale of T and
+    of the scene (those that the fit counts, or found), and is fitted by kinetic theory. The same is
+    done with the alternative that widens the range most as the truth, at half of its largest
+    allowed amplitude; if the data prefer one, at its own amplitude and estimate. Contacts of the
+    runs have no duration; <dr^2> is left out.
 
     Args:
         result: a fit of one curve, with N.
@@ -225,7 +225,8 @@ def _imitated(
             "imitations begin with the gas. Leave the earlier rows out"
         )
     curve = cool(gas, since, model=several, key=of_start, progress=progress)
-    twins = _measured(measurement, result, curve, runs, of_errors)
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(of_errors)))
+    twins = imitations(measurement, result, curve, runs, rng)
     without = {"softness", "correlations"} if isinstance(model, DSMC) else {"softness"}
     theory = KineticTheory(corrections=KineticTheory.all_corrections - without)
     fits: list[Fit] = []
@@ -253,43 +254,6 @@ def _imitated(
         error=values[:, 1],
         grades=tuple(f.grade for f in fits),
     )
-
-
-def _measured(
-    measurement: Measurement, result: Fit, curve: CoolingCurve, runs: int, key: PRNGKeyArray
-) -> list[Measurement]:
-    """Return each imitation as it would be measured, with the errors of the measurement.
-
-    Args:
-        measurement: what is imitated.
-        result: its fit; errors keep their size relative to the fitted values.
-        curve: by a particle model, with the curves of all replicas.
-        runs: number of imitations.
-        key: of the errors.
-    """
-    fields = {}
-    for number, name in enumerate(("temperature", "rotational_temperature")):
-        if getattr(measurement.curve, name) is None:
-            continue
-        each = np.asarray(getattr(curve.replicas, name)).reshape(runs, measurement.replicas, -1)
-        values = each.mean(axis=1)
-        error = getattr(measurement.curve, f"{name}_error")
-        if error is not None:
-            relative = np.asarray(error) / np.asarray(getattr(result.curve, name))
-            fields[f"{name}_error"] = relative * values
-            if measurement.replicas == 1 or measurement.errors_measured:
-                noise = np.asarray(jax.random.normal(jax.random.fold_in(key, number), values.shape))
-                values = values * (1 + relative * noise)
-        fields[name] = values
-    return [
-        replace(
-            measurement,
-            data=replace(
-                measurement.curve, **as_jax_arrays({name: x[run] for name, x in fields.items()})
-            ),
-        )
-        for run in range(runs)
-    ]
 
 
 def _counted(grades: tuple[str, ...]) -> str:

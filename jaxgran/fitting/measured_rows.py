@@ -56,7 +56,7 @@ def curve_rows(
     """
     gas = measurement.gas
     values = _values(measurement)
-    errors, notes = _errors(measurement, values)
+    errors, notes = errors_that_count(measurement)
     displacement = None
     if not fits_t0:
         displacement, of_displacement = _displacement(measurement, model)
@@ -93,10 +93,14 @@ def _values(measurement: Measurement) -> Float[np.ndarray, "times 2"]:
     return np.stack([T, T_rot], axis=1)
 
 
-def _errors(
-    measurement: Measurement, values: Float[np.ndarray, "times 2"]
+def errors_that_count(
+    measurement: Measurement,
 ) -> tuple[Float[np.ndarray, "times 2"], list[str]]:
-    """Return the standard errors of T and T_rot with the rounding of the file, and notes."""
+    """Return the standard errors of T and T_rot that a fit counts, and notes on the others.
+
+    They include the rounding of the file; 0 where a value has no error.
+    """
+    values = _values(measurement)
     dimension = measurement.gas.dimension
     notes: list[str] = []
     given = measurement.curve.temperature_error
@@ -133,19 +137,23 @@ def _used(
 
 def _grains(measurement: Measurement, fits_T_0: bool) -> Grains:
     N = measurement.num_particles
-    runs = measurement.replicas
-    dimension = measurement.gas.dimension
-    tracked = measurement.tracked
-    sample = 0.0
-    if tracked is not None:
-        left = 1 - (0 if N is None else tracked / N)
-        sample = 2 / (dimension * tracked * runs) * left
+    is_ensemble = measurement.ensemble_start and not fits_T_0
     return Grains(
-        inverse_number=1 / ((UNKNOWN_NUMBER if N is None else N) * runs),
+        inverse_number=1 / ((UNKNOWN_NUMBER if N is None else N) * measurement.replicas),
         log_error=WEAK_SCATTER if N is None else SCATTER_ERROR,
-        sample=sample,
-        first=2 / dimension if measurement.ensemble_start and not fits_T_0 else 0.0,
+        sample=sampling_variance(measurement),
+        first=2 / measurement.gas.dimension if is_ensemble else 0.0,
     )
+
+
+def sampling_variance(measurement: Measurement) -> float:
+    """Return the variance of ln T where some of the grains are tracked; 0 if all are."""
+    tracked = measurement.tracked
+    if tracked is None:
+        return 0.0
+    N = measurement.num_particles
+    left = 1 - (0 if N is None else tracked / N)
+    return 2 / (measurement.gas.dimension * tracked * measurement.replicas) * left
 
 
 def _finite_size_factor(measurement: Measurement) -> float:

@@ -173,6 +173,7 @@ def with_words(
         *rising,
         *_misfit(result, scatters_more, scatters_less, is_misfit),
         *_scatter(result),
+        *_errors_of_T(result),
         *_of_each(result),
         *_alternatives(result, quick=quick),
         *notes,
@@ -370,6 +371,12 @@ def _scatter(result: Fit) -> Iterator[str]:
             prefix = f"{label}: " if label else ""
             error = number * error
             yield prefix + say("scatter", number=two_digits(number), error=two_digits(error))
+
+
+def _errors_of_T(result: Fit) -> Iterator[str]:
+    """Yield a clause on the errors of T that a fit found in curves without errors."""
+    for label, error in result.errors_of_T.items():
+        yield f"{label}: " * bool(label) + say("errors of T", percent=100 * error)
 
 
 def _of_each(result: Fit) -> Iterator[str]:

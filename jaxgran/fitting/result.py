@@ -63,6 +63,8 @@ class Fit:
             "drop test".
         scatter: the variance by the collisions of N grains over what theory gives for N (for 1000
             grains where N is not known), and its standard error, by label.
+        errors_of_T: relative standard deviation of independent errors of T, by label, for curves
+            without errors that scatter more than their grains can.
         scales: numbers that describe each fitted gas: phi, tau_c (s), t_c/tau_c, beta at sqrt(2
             T_0), eps at the thermal speeds of t = 0 and of the last T, the mean free path and the
             side of a cube of N grains (m), by label.
@@ -109,6 +111,7 @@ class Fit:
     log_likelihood: float
     residuals: dict[str, dict[str, np.ndarray]]
     scatter: dict[str, tuple[float, float]]
+    errors_of_T: dict[str, float]
     scales: dict[str, dict[str, float]]
     start_time: dict[str, float]
     weights: dict[str, np.ndarray]

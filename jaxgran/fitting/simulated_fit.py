@@ -299,6 +299,7 @@ def _result(
         log_likelihood=-0.5 * found.value,
         residuals={"": by_field},
         scatter={"": (expansion.scatter, scatter_error)},
+        errors_of_T={},
         scales={"": describe_gas(gas, sims.rows)},
         start_time={"": 0.0},
         weights={"": np.ones(p)},

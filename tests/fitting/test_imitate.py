@@ -2,13 +2,13 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxgran
 from jaxgran.fitting import imitate as module
+from jaxgran.fitting.drawn_errors import imitations
 from tests.beads import glass_beads
 
 TIMES = np.geomspace(0.1, 10.0, 10)
@@ -19,7 +19,7 @@ RUNS = 300
 def planned(**options) -> jaxgran.Measurement:
     T = jaxgran.cool(GAS, TIMES).temperature
     curve = jaxgran.CoolingCurve(TIMES, T, temperature_error=0.02 * T)
-    return jaxgran.Measurement(GAS, curve, **{"num_particles": 64} | options)
+    return jaxgran.Measurement(GAS, **{"data": curve, "num_particles": 64} | options)
 
 
 def counted(low, high, estimate, error, **fields) -> jaxgran.Imitation:
@@ -39,28 +39,54 @@ def test_ranges_that_hold_the_truth_are_counted():
     assert "after 1 of 9 runs" in repr(counted([0], [2], [1], [1], asked=9))
 
 
-def test_imitations_have_the_errors_of_the_measurement():
-    T = np.broadcast_to(planned().curve.temperature, (2 * RUNS, TIMES.size))
-    runs = jaxgran.CoolingCurve(TIMES, T[0], replicas=jaxgran.CoolingCurve(TIMES, jnp.asarray(T)))
+def imitated(measurement, errors_of_T=0.0, runs=2 * RUNS):
+    """The imitations of a measurement, and their T over the exact one."""
     exact = jaxgran.cool(GAS, TIMES)
-    result = FakeFit(exact)
-    mean = planned(replicas=2, errors_measured=True)
-    for measurement, error, number in ((planned(), 0.02, 2 * RUNS), (mean, 0.02, RUNS)):
-        each = module._measured(measurement, result, runs, number, jax.random.key(0))
-        assert len(each) == number
-        ratio = np.array([m.curve.temperature for m in each]) / T[0]
-        assert np.std(ratio) == pytest.approx(error, rel=0.1)
-        relative = each[0].curve.temperature_error / T[0]
-        assert np.allclose(relative, 0.02)
-    noiseless = module._measured(planned(replicas=2), result, runs, RUNS, jax.random.key(0))
-    assert np.allclose(noiseless[0].curve.temperature, T[0])
+    T = jnp.broadcast_to(exact.temperature, (2 * RUNS, TIMES.size))
+    replicas = jaxgran.CoolingCurve(TIMES, T)
+    curve = dataclasses.replace(exact, replicas=replicas)
+    result = FakeFit(exact, {"": errors_of_T})
+    each = imitations(measurement, result, curve, runs, np.random.default_rng(0))
+    assert len(each) == runs
+    return each, np.array([m.curve.temperature for m in each]) / np.asarray(T[0])
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        pytest.param({"errors_measured": True}, 0.02, id="as given"),
+        pytest.param({"errors_measured": True, "replicas": 2}, 0.02, id="of a mean"),
+        pytest.param({"replicas": 2}, 0.0, id="by the grains of the runs"),
+        pytest.param({"num_particles": 1667}, 0.0, id="by the grains of one run"),
+        pytest.param({"tracked": 32}, (2 / 3 / 32 * 0.5) ** 0.5, id="sampling"),
+        pytest.param({"calibration_error": 0.05, "replicas": 2}, 0.05, id="scale of T"),
+    ],
+)
+def test_imitations_have_the_errors_that_the_fit_counts(options, error):
+    each, ratio = imitated(planned(**options), runs=2 * RUNS // options.get("replicas", 1))
+    assert np.std(ratio) == pytest.approx(error, rel=0.1, abs=1e-3)
+    assert np.mean(ratio) == pytest.approx(1.0, abs=0.02)
+    relative = each[0].curve.temperature_error / each[0].curve.temperature
+    assert np.allclose(relative, 0.02, rtol=0.3)
+
+
+def test_errors_that_the_fit_found_are_drawn_and_priors_are_about_the_truth():
+    T = jaxgran.cool(GAS, TIMES).temperature
+    priors = {"density": (2600.0, 125.0)}
+    bare = planned(data=jaxgran.CoolingCurve(TIMES, T), priors=priors)
+    each, ratio = imitated(bare, errors_of_T=0.03)
+    assert np.std(ratio) == pytest.approx(0.03, rel=0.1)
+    densities = np.array([m.priors["density"][0] for m in each])
+    assert np.mean(densities) == pytest.approx(2500.0, rel=0.01)
+    assert np.std(densities) == pytest.approx(120.0, rel=0.1)
 
 
 class FakeFit(jaxgran.Fit):
-    """A fit of which the curve alone is known."""
+    """A fit of which the curve and its errors alone are known."""
 
-    def __init__(self, curve):
+    def __init__(self, curve, errors_of_T=()):
         object.__setattr__(self, "curve", curve)
+        object.__setattr__(self, "errors_of_T", dict(errors_of_T))
 
 
 @pytest.mark.parametrize(
