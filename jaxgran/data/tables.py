@@ -471,12 +471,14 @@ def _convert_header(header: dict[str, str], units: dict[str, str], comma: bool) 
         if _base_unit(key, HEADER_UNITS) is None or not _is_relative(key, units_given):
             continue
         value_key = key.removesuffix("_err")
-        if value_key not in converted and value_key != "T_scale":  # which is 1
+        if value_key == "T_scale":  # whose error is a part of it
+            continue
+        if value_key not in converted:
             raise ValueError(
                 f"header line {key} is a part of {value_key}, which the header lacks: add "
                 f"{value_key}, or give the error in a unit"
             )
-        value = converted.get(value_key, "1")
+        value = converted[value_key]
         if _NUMBER.fullmatch(value):
             converted[key] = repr(float(converted[key]) * abs(float(value)))
     return converted
@@ -493,7 +495,17 @@ def _with_own_errors(header: dict[str, str]) -> dict[str, str]:
             raise ValueError(f"header line {key}: {text!r} gives {key}_err again; remove one")
         if error:
             split |= {key: value, f"{key}_err": error}
+    if "T_scale" in split and "T_scale_err" not in header:
+        split |= _relative_error_of_scale(split)
     return split
+
+
+def _relative_error_of_scale(header: dict[str, str]) -> dict[str, str]:
+    """Return the error behind T_scale as `T_scale_err`, which is a part of it."""
+    error = header.get("T_scale_err", "")
+    if not (_NUMBER.fullmatch(error) and _NUMBER.fullmatch(header["T_scale"])):
+        return {}
+    return {"T_scale_err": repr(float(error) / abs(float(header["T_scale"])))}
 
 
 def _value_and_error(text: str) -> tuple[str, str]:
@@ -567,7 +579,9 @@ def _factor(name: str, units_given: dict[str, str], units: dict[str, str], kind:
     base = _base_unit(name)
     if base is None:
         return 1.0
-    unit = units_given[name] or units_given.get(name.removesuffix("_err")) or units.get(base, base)
+    # Frames are counted per second in files whose times are in ms, too.
+    inherited = base if name == "frame_rate" else units.get(base, base)
+    unit = units_given[name] or units_given.get(name.removesuffix("_err")) or inherited
     if _is_relative(name, units_given):
         return unit_in(unit, "1")
     if unit in (base, base.replace("m^2/s^2", "(m/s)^2")):

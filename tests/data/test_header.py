@@ -47,6 +47,15 @@ def test_a_side_has_the_unit_that_was_given(keys):
 def test_an_error_in_per_cent_needs_its_value():
     assert header_in_si({"phi": "0.04", "phi_err": "5 %"})["eta_err"] == "0.002"
     assert float(header_in_si({"T_scale_err": "2 %"})["T_scale_err"]) == approx(0.02)
+    # Behind the scale it is an error of the scale, alone a part of it.
+    assert float(header_in_si({"T_scale": "2.00 ± 0.03"})["T_scale_err"]) == approx(0.015)
+    assert float(header_in_si({"T_scale": "2 ± 3 %"})["T_scale_err"]) == approx(0.03)
+    assert float(header_in_si({"T_scale": "2", "T_scale_err": "0.03"})["T_scale_err"]) == 0.03
+
+
+def test_frames_are_counted_per_second_whatever_the_unit_of_times():
+    assert float(header_in_si({"time_unit": "ms", "frame_rate": "500"})["frame_rate"]) == 500
+    assert float(header_in_si({"frame_rate": "0.5 kHz"})["frame_rate"]) == approx(500)
     assert header_in_si({"camera_err": "2 %"})["camera_err"] == "2 %"
     with pytest.raises(ValueError, match="density_err is a part of density, which .* lacks"):
         header_in_si({"density_err": "2 %"})
