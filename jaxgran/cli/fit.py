@@ -281,6 +281,8 @@ def parse_settings(pairs: Sequence[str]) -> dict[str, str]:
         key, equals, value = pair.partition("=")
         if not equals or key not in known:
             raise ValueError(f"--set {pair}: give KEY=VALUE with KEY one of {', '.join(known)}")
+        if key in values:
+            raise ValueError(f"--set gives {key} twice, {values[key]} and {value}: remove one")
         values[key] = value
     with name_in_errors(Path("--set")):
         header_in_si(values)

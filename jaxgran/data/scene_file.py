@@ -67,6 +67,10 @@ def _text(key: str, value: Any) -> str:
     return (", " if key == "absent" else " x ").join(map(str, value))
 
 
+MAX_TIMES = 100_000
+"""Largest number of times of a planned experiment."""
+
+
 def times_of(experiment: dict[str, Any]) -> np.ndarray:
     """Return the times of a planned experiment, s.
 
@@ -85,6 +89,8 @@ def times_of(experiment: dict[str, Any]) -> np.ndarray:
     if not isinstance(times, dict) or {*times} != {"number", "first", "last"}:
         raise ValueError(f"[{EXPERIMENT}] times: give {HOW_TO_GIVE_TIMES}, got {times!r:.80}")
     number = checked_int("number of times", times["number"], 2)
+    if number > MAX_TIMES:
+        raise ValueError(f"number of times must be at most {MAX_TIMES}, got {number}")
     first = checked_float("first of times", times["first"], POSITIVE, "Give it in s.")
     last = checked_float("last of times", times["last"], POSITIVE, "Give it in s.")
     if not first < last:

@@ -88,6 +88,7 @@ BAD_INPUT = {
     "fit thin.csv --set beta_t=guess": "the value of beta_t is a guess: free it, too",
     "fit thin.csv --set 'T0=2 kg'": "--set: header line T0: 'kg' is not known",
     "fit thin.csv --set youngs=1": "give KEY=VALUE with KEY one of",
+    "fit thin.csv --set A=1e-6 A=2e-6": "--set gives A twice, 1e-6 and 2e-6",
     "fit thin.csv --set N=many": "header line N",
     "fit thin.csv --set Y=0.05": "in Pa",
     "fit thin.csv --free T0": "leaves A fixed",

@@ -25,6 +25,7 @@ def test_an_experiment_is_read_from_a_scene(scene):
         ("T_err = 0.02", "T_err = 3.0", "T_err must lie in (0, 1), got 3. It is relative"),
         ("T_err = 0.02", "T_err = 0.0", "T_err must lie in (0, 1), got 0"),
         ("number = 10", "number = 1", "number of times must be"),
+        ("number = 10", "number = 10000000000000", "at most 100000, got 10000000000000"),
         ("last = 10.0", "last = 0.05", "last must lie after first"),
         (", last = 10.0", "", "give times = [0.1, 0.3, 1.0] or times = {number"),
         ("times = {number = 10, first = 0.1, last = 10.0}", "", "[experiment] has no times"),
