@@ -99,13 +99,17 @@ class Explanations(NamedTuple):
     Attributes:
         law: the fitted law itself.
         alternatives: to it, those that fit best first.
+        significant: decrease of -2 ln L from which an explanation excludes others.
     """
 
     law: Alternative
     alternatives: tuple[Alternative, ...]
+    significant: float
 
     def ranges(self, without: Sequence[Alternative] = ()) -> tuple[np.ndarray, np.ndarray]:
-        """Return the 95 % range of the free parameters over all explanations that fit best.
+        """Return the 95 % range of the free parameters over all explanations.
+
+        One that fits significantly worse than the best one is excluded.
 
         Args:
             without: explanations that are left out.
@@ -117,7 +121,7 @@ class Explanations(NamedTuple):
         allowed = [
             x
             for x in considered
-            if x.improvement >= best - ALLOWED_OVER_ALL or (x is self.law and not self.is_rejected)
+            if x.improvement >= best - self.significant or (x is self.law and not self.is_rejected)
         ]
         low = np.min([x.low for x in allowed], axis=0)
         high = np.max([x.high for x in allowed], axis=0)
@@ -181,7 +185,7 @@ def compare_alternatives(
         if number + 1 < len(stages):
             beside = built[stages[number + 1].shown[-1]]
     best_first = sorted(alternatives, key=lambda alternative: -alternative.improvement)
-    return Explanations(law, tuple(best_first))
+    return Explanations(law, tuple(best_first), significant)
 
 
 class _Stage(NamedTuple):

@@ -246,12 +246,13 @@ def _first_parameter(result: Fit) -> str:
 def _narrowing(result: Fit, explanations: Explanations) -> str:
     """Return which effects, known to be absent, would narrow the range of the first parameter."""
     wide = [x for x in explanations.alternatives if x.effect and not x.distinguishable]
-    others = [x for x in (explanations.law, *explanations.alternatives) if x not in wide]
+    effects = sorted({x.effect for x in wide})
+    excluded = [x for x in explanations.alternatives if x.effect in effects]
+    others = [x for x in (explanations.law, *explanations.alternatives) if x not in excluded]
     best = max(x.improvement for x in (explanations.law, *explanations.alternatives))
     if not wide or max(x.improvement for x in others) < best - 2 * NARROWING_LOSS:
         return ""
-    effects = sorted({x.effect for x in wide})
-    low, high = explanations.ranges(without=wide)
+    low, high = explanations.ranges(without=excluded)
     widest_low, widest_high = explanations.ranges()
     gain = max(low[0] - widest_low[0], widest_high[0] - high[0])
     if not gain > DISTINGUISHABLE_SHARE * abs(result.estimate[0]):
