@@ -378,6 +378,10 @@ CALLS = [
     ),
     (lambda: jaxgran.log_likelihood(GAS, CURVE), "measurement must be a jaxgran.Measurement"),
     (lambda: jaxgran.log_likelihood(GAS, measured(DROPS)), "a drop test, without a curve"),
+    (
+        lambda: jaxgran.log_likelihood(GAS, measured(priors={"t0": (1.0, 0.1)})),
+        "log_likelihood has no t0: give the times since the start",
+    ),
     (lambda: jaxgran.RestitutionSpline([1.0]), "two or more increasing"),
     (lambda: jaxgran.RestitutionSpline([0.1, 1.0], [0.8, 0.9]), "do not increase"),
     (lambda: jaxgran.RestitutionSpline([0.1, 1.0], [1.1, 0.9]), r"in \(0, 1\]"),

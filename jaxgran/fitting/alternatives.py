@@ -67,8 +67,8 @@ class Alternative(NamedTuple):
         preferred: True if the data prefer this alternative to the fitted law, or several effects
             together to those without the last one; by chance they prefer any of the alternatives in
             1 % of fits.
-        distinguishable: True if the data allow so little of the alternative that it widens the
-            range of the first parameter by less than 10 %.
+        distinguishable: True if the data exclude the alternative, or allow so little of it that it
+            widens the range of the first parameter by less than 10 %.
         error_reduction_needed: factor by which the errors must decrease for that; 1 if it is
             distinguishable.
         restitution: eps of an alternative in which it is constant, so that A has no meaning; None
@@ -99,7 +99,8 @@ class Explanations(NamedTuple):
     Attributes:
         law: the fitted law itself.
         alternatives: to it, those that fit best first.
-        significant: decrease of -2 ln L from which an explanation excludes others.
+        significant: decrease of -2 ln L from which an explanation excludes others; infinite for a
+            curve that is smoother than N grains allow, of which all explanations remain.
     """
 
     law: Alternative
@@ -253,7 +254,7 @@ def _beside(stage: _Stage, first: Kind) -> _Stage | None:
     """
     problem = stage.problem
     at_best = stage.best_of(first)
-    name = first.parameters[0]
+    name = first.varied
     values = first.values_by_label(problem, at_best.amplitude)
     guesses = {label: own.pop(name) for label, own in values.items()}
     labels = list(first.curves)
@@ -264,10 +265,7 @@ def _beside(stage: _Stage, first: Kind) -> _Stage | None:
         unknowns = [unknown_of(name, x, gases[x], problem.curves) for x in labels]
     start = [u.domain.to_free(guesses[x]) / u.unit for u, x in zip(unknowns, labels, strict=False)]
     changed = with_wider_rate_error(problem, first.rate_error(at_best.amplitude))
-    fixed = {
-        label: problem.fixed.get(label, {}) | values.get(label, {})
-        for label in {*problem.fixed, *values}
-    }
+    fixed = problem.fixed_with(values)
     both = replace(changed, unknowns=(*problem.unknowns, *unknowns), fixed=fixed)
     origin = np.append(stage.origin, start)
     base = trial_of(both, 0.0, np.append(at_best.flat, start), origin)
@@ -327,7 +325,8 @@ class _Summary(NamedTuple):
         high = self._in_si(np.max(allowed.high, axis=0), best)
         estimate = self.problem.estimates(best.flat)
         wider = 0.0
-        if beside is not None:
+        is_excluded = best.value > self.best.value + self.significant
+        if beside is not None and not is_excluded:
             beyond = max(beside.low[0] - low[0], high[0] - beside.high[0])
             wider = beyond / abs(beside.estimate[0])
         known = {parameter: name for name, (parameter, _) in DECLARABLE.items()}

@@ -87,12 +87,15 @@ class Candidate(NamedTuple):
 
 def standard_candidates(measurement: Measurement) -> list[Candidate]:
     """Return the additions that apply to a planned curve."""
+    t0 = _start_time(measurement)
+    duration = float(measurement.curve.times[-1]) - t0
+    box_factor = 2**measurement.gas.dimension
     found = [
         Candidate("T_rot measured", "the rotation of marked grains", with_rotation, "rotation"),
         *(
             Candidate(
                 f"duration x {factor:g}",
-                f"the last time at {factor * measurement.curve.times[-1]:.3g} s",
+                f"the last time at {t0 + factor * duration:.3g} s",
                 partial(with_duration, factor=factor),
                 "duration",
             )
@@ -106,7 +109,12 @@ def standard_candidates(measurement: Measurement) -> list[Candidate]:
             with_more_grains,
             "grains",
         ),
-        Candidate("container x 2", "8 times as many grains at this density", in_larger_box, "box"),
+        Candidate(
+            "container x 2",
+            f"{box_factor} times as many grains at this density",
+            in_larger_box,
+            "box",
+        ),
         Candidate("a second density", "a second run", with_second_density, "density"),
         Candidate(
             f"eps_w known to +-{WALL_ERROR:g}",
@@ -197,11 +205,15 @@ def with_more_grains(measurement: Measurement, factor: int = MORE_GRAINS) -> Mea
     if measurement.num_particles is None:
         return None
     gas = measurement.gas
+    priors = dict(measurement.priors)
     if gas.container is not None:
-        side = np.asarray(gas.value("wall_side")) * factor ** (1 / gas.dimension)
-        gas = gas.replace(wall_side=side)
+        longer = factor ** (1 / gas.dimension)
+        gas = gas.replace(wall_side=longer * np.asarray(gas.value("wall_side")))
+        if "wall_side" in priors:
+            value, error = priors["wall_side"]
+            priors["wall_side"] = longer * value, longer * error
     number = factor * measurement.num_particles
-    return dataclasses.replace(measurement, gas=gas, num_particles=number)
+    return dataclasses.replace(measurement, gas=gas, num_particles=number, priors=priors)
 
 
 def in_larger_box(measurement: Measurement) -> Measurement | None:

@@ -10,7 +10,7 @@ from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.measurement import DENSITY, START_TIME, Measurement, Priors, prior_domain
 from jaxgran.fitting.innovations import SAMPLE_MEMORY
-from jaxgran.fitting.measured_rows import errors_that_count, sampling_variance
+from jaxgran.fitting.measured_rows import sampling_variance
 from jaxgran.fitting.result import Fit
 
 QUANTITIES = ("temperature", "rotational_temperature")
@@ -29,30 +29,32 @@ def imitations(
     that is known of the scene.
 
     Args:
-        measurement: what is imitated, of one curve.
+        measurement: what is imitated, of one curve, with the errors that count.
         result: its fit; errors keep their size relative to the fitted values.
         curve: by a particle model, with the curves of all replicas.
         runs: number of imitations.
         rng: random numbers.
     """
-    used, _ = errors_that_count(measurement)
-    factors = np.exp(measurement.calibration_error * rng.normal(size=(runs, 1)))
+    scale = np.exp(measurement.calibration_error * rng.normal(size=(runs, 1)))
     fields = {}
-    for number, name in enumerate(QUANTITIES):
+    for name in QUANTITIES:
         if getattr(measurement.curve, name) is None:
             continue
         each = np.asarray(getattr(curve.replicas, name)).reshape(runs, measurement.replicas, -1)
         values = each.mean(axis=1)
-        fitted = np.asarray(getattr(result.curve, name))
-        relative = used[:, number] / fitted
+        found = 0.0
         if name == "temperature":
-            relative = np.hypot(relative, result.errors_of_T.get("", 0.0))
             values = values * np.exp(_sampling_errors(measurement, curve, runs, rng))
-        values = values * (1 + relative * rng.normal(size=values.shape))
+            found = result.errors_of_T.get("", 0.0)
         error = getattr(measurement.curve, f"{name}_error")
+        noise = np.expm1(found * rng.normal(size=values.shape)) * values
         if error is not None:
-            fields[f"{name}_error"] = np.asarray(error) / fitted * values * factors
-        fields[name] = values * factors
+            fitted = np.asarray(getattr(result.curve, name))
+            ratio = np.divide(values, fitted, out=np.ones_like(values), where=fitted > 0)
+            errors = np.asarray(error) * ratio
+            noise += errors * rng.normal(size=values.shape)
+            fields[f"{name}_error"] = errors * scale
+        fields[name] = (values + noise) * scale
     curves = [
         replace(measurement.curve, **as_jax_arrays({name: x[run] for name, x in fields.items()}))
         for run in range(runs)

@@ -37,6 +37,16 @@ from jaxgran.models.scales import scales_at
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.parameters import symbol_of
 
+ROUGHNESS_LIMITS = (1e-4, 1.0)
+"""Range of the first guess of independent errors of T; less than two differences give the first."""
+
+MAX_DISTANCE = 3.0
+"""Factor between measured and fitted T. If `DISTANT_SHARE` of the values differ by more, the scale
+of T or of time is wrong."""
+
+DISTANT_SHARE = 0.8
+"""Share of such values: where T has fallen most, a curve in another unit may come near."""
+
 
 def fit_without_noise(request: Request, max_steps: int, descent: Descent | None = None) -> Fit:
     """Fit a model without noise, starting at the best of some guesses."""
@@ -48,13 +58,13 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
         best, minima = best_of_starts(problem, first, max_steps, descent)
     check_computed(problem, best)
     explanations = None
-    told = problem
-    of_law = goodness(told, told.evaluate(best.flat))
+    given = problem
+    of_law = goodness(given, given.evaluate(best.flat))
     if descent is None and (of_law["p_value"] < SIGNIFICANCE or not best.converged):
         has_ended = best.converged
         problem, best, minima = _with_errors_of_T(problem, first, best, minima, max_steps)
         if not has_ended:
-            of_law = goodness(told, told.evaluate(best.flat[: first.size]))
+            of_law = goodness(given, given.evaluate(best.flat[: first.size]))
     distant = distant_curves(problem, problem.evaluate(best.flat))
     if distant:
         notes = [*notes, say("distant", ratio=MAX_DISTANCE)]
@@ -65,7 +75,7 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
     result = replace(assembled(request, problem, best, minima, explanations), **of_law)
     share = measurement_share(problem, problem.evaluate(best.flat))
     if result.p_value < SIGNIFICANCE and not request.quick and not distant:
-        notes += _outlier_notes(told, first, max_steps)
+        notes += _outlier_notes(given, first, max_steps)
     scatter = problem.evaluate(best.flat).scatter_of_eps
     if scatter is not None:
         notes = [*notes, say("scatter of eps", scatter=scatter)]
@@ -98,18 +108,8 @@ def _roughness(m: CurveRows, computed: np.ndarray) -> float:
     used = (m.used[:, 0] > 0) & (m.values[:, 0] > 0)
     residuals = np.log(m.values[used, 0] / computed[used])
     second = np.diff(residuals, 2)
-    return float(np.clip(np.sqrt(np.mean(second**2) / 6), *ROUGHNESS_LIMITS))
-
-
-ROUGHNESS_LIMITS = (1e-4, 1.0)
-"""Range of the first guess of independent errors of T; less than two differences give the first."""
-
-MAX_DISTANCE = 3.0
-"""Factor between measured and fitted T. If `DISTANT_SHARE` of the values differ by more, the scale
-of T or of time is wrong."""
-
-DISTANT_SHARE = 0.8
-"""Share of such values: where T has fallen most, a curve in another unit may come near."""
+    variance = np.mean(second**2) / 6 if second.size else 0.0
+    return float(np.clip(np.sqrt(variance), *ROUGHNESS_LIMITS))
 
 
 def distant_curves(problem: Problem, found: Evaluation) -> list[str]:

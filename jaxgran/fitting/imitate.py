@@ -16,6 +16,7 @@ from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.measurement import START_TIME, Measurement
 from jaxgran.fitting.drawn_errors import imitations
 from jaxgran.fitting.fit import fit
+from jaxgran.fitting.measured_rows import with_errors_that_count
 from jaxgran.fitting.result import CONDITIONAL, Fit
 from jaxgran.fitting.twins import AS_GIVEN, Truth, strongest_effect
 from jaxgran.models.base import AbstractModel
@@ -125,10 +126,10 @@ def imitate(
     """Simulate the fitted scene many times, fit each run, and count how often the range holds.
 
     Each run has the times, N, number of runs and errors of the measurement, of the scale of T and
-    of the scene (those that the fit counts, or found), and is fitted by kinetic theory. The same is
-    done with the alternative that widens the range most as the truth, at half of its largest
-    allowed amplitude; if the data prefer one, at its own amplitude and estimate. Contacts of the
-    runs have no duration; <dr^2> is left out.
+    of the scene (those that the fit counts, or found), begins with T_0, and is fitted by kinetic
+    theory. The same is done with the alternative that widens the range most as the truth, at half
+    of its largest allowed amplitude; if the data prefer one, at its own amplitude and estimate.
+    Contacts of the runs have no duration; <dr^2> is left out.
 
     Args:
         result: a fit of one curve, with N.
@@ -179,6 +180,11 @@ def _checked(result: Any, runs: int) -> Measurement:
         )
     if [*result.measurements] != [""] or not isinstance(result.curve, CoolingCurve):
         raise ValueError("imitate takes a fit of one curve: imitate the curves one by one")
+    if result.names[0] not in result.gas.domains:
+        raise ValueError(
+            "imitate counts ranges of the first free parameter, which must be one of the gas, got "
+            f"{result.names[0]}: free another one first"
+        )
     measurement = result.measurements[""]
     N = measurement.num_particles
     if N is None:
@@ -194,7 +200,9 @@ def _checked(result: Any, runs: int) -> Measurement:
     priors = dict(measurement.priors)
     if START_TIME in priors:
         priors[START_TIME] = jnp.asarray(result.start_time[""]), priors[START_TIME][1]
-    return replace(measurement, gas=result.gas, data=curve, rounding={}, priors=priors)
+    imitated = replace(measurement, gas=result.gas, data=curve, rounding={}, priors=priors)
+    # Particles start with exactly T_0, so that it is the T_0 of each run.
+    return replace(with_errors_that_count(imitated), ensemble_start=False)
 
 
 def _imitated(

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.problem import Problem
@@ -94,6 +95,7 @@ class Kind:
         amplitudes: values that are tried, in one or two increasing sequences from 0.
         values: values of parameters at an amplitude, beside a fitted curve; parameters of a law of
             impacts do not depend on the curve.
+        amplitude_sets: the parameter that the amplitude sets, if it is not the first one.
         applies: whether it is an alternative for a curve that may have its parameters, given the
             names of the curve's unknowns.
         rate_error: relative error of kinetic theory's cooling rate by it, at an amplitude.
@@ -107,12 +109,18 @@ class Kind:
     parameters: tuple[str, ...]
     amplitudes: tuple[tuple[float, ...], ...]
     values: Callable[[float, FittedCurve], dict[str, float]]
+    amplitude_sets: str = ""
     applies: Callable[[CurveRows, set[str]], bool] = lambda rows, unknowns: True
     rate_error: Callable[[float], float] = lambda amplitude: 0.0
     one_minimum: bool = True
     changes_law: bool = False
     keeps_A: bool = True
     curves: dict[str, FittedCurve] = field(default_factory=dict)
+
+    @property
+    def varied(self) -> str:
+        """The parameter that the amplitude sets."""
+        return self.amplitude_sets or self.parameters[0]
 
     def values_by_label(self, problem: Problem, amplitude: float) -> dict[str, dict[str, float]]:
         """Return the values of parameters in each measurement that it changes."""
@@ -184,6 +192,7 @@ KINDS = (
     Kind(
         name="rough grains that slide",
         parameters=("tangential_restitution", "friction"),
+        amplitude_sets="friction",
         amplitudes=(FRICTION,),
         values=lambda x, curve: {
             "tangential_restitution": STICKING_RESTITUTION,
@@ -286,10 +295,19 @@ def _fitted_curves(problem: Problem, flat: np.ndarray) -> dict[str, FittedCurve]
 
 
 def _initial_rate(m: CurveRows, values: dict[str, Any], curve: dict[str, Any]) -> float:
-    """Return the cooling rate at the start of a fitted curve, from the time in which T halves."""
+    """Return the cooling rate at the start of a fitted curve, 1/s."""
     T_0 = float(values.get("temperature", m.scene.temperature))
     times = np.asarray(m.curve.times) - float(values.get(START_TIME, 0.0))
-    log_T = np.log(curve["temperature"] / T_0)
+    return initial_rate(times, np.log(curve["temperature"] / T_0))
+
+
+def initial_rate(times: Float[np.ndarray, "n"], log_T: Float[np.ndarray, "n"]) -> float:
+    """Return the cooling rate at the start, 1/s, from the time in which T halves.
+
+    Args:
+        times: since the start, s.
+        log_T: ln T/T_0 at these times.
+    """
     fallen = np.flatnonzero((log_T < -np.log(2)) & (times > 0))
     at = fallen[0] if fallen.size else -1
     cooled = np.expm1(-0.6 * min(log_T[at], -1e-6))  # 1 + t/tau = T^(-3/5)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxgran.data.curve import DEFAULTS, CoolingCurve
-from jaxgran.data.measurement import Measurement
+from jaxgran.data.measurement import START_TIME, Measurement
 from jaxgran.fitting.innovations import Nodes, filtered, log_density_change, log_ratio
 from jaxgran.fitting.measured_rows import curve_rows, with_rate_error
 from jaxgran.fitting.parameters import guess_from_data
@@ -43,7 +43,8 @@ def log_likelihood(
 ) -> Float[Array, ""]:
     """Logarithm of the likelihood of a measured curve, up to a constant.
 
-    It is the likelihood that `jaxgran.fit` maximises, without priors: ``-(r^T C^-1 r + ln det
+    It is the likelihood that `jaxgran.fit` maximises where T_0 is known, without priors, and
+    without the errors of T that a fit finds in a curve without errors: ``-(r^T C^-1 r + ln det
     C)/2`` with the residuals r of ln T, and of ln T_rot and <dr^2> where they are compared, and
     their covariance C by the collisions of N grains, the errors of the measurement and the error
     of theory's cooling rate. Common factors of T_rot and of <dr^2>, the scale of T, and the
@@ -61,8 +62,8 @@ def log_likelihood(
         The logarithm; -inf if the model cannot compute the curve.
 
     Raises:
-        ValueError: for a drop test, a scene that the model does not support, or a stochastic model,
-            whose noise differs between calls.
+        ValueError: for a drop test, a prior of t0, a scene that the model does not support, or a
+            stochastic model, whose noise differs between calls.
 
     >>> measurement = jaxgran.Measurement(gas, curve, num_particles=1000)
     >>> other = gas.replace(dissipative_constant=4e-6)
@@ -78,6 +79,11 @@ def log_likelihood(
         )
     if not isinstance(measurement, Measurement):
         raise ValueError(f"measurement must be a jaxgran.Measurement, got {measurement!r:.60}")
+    if START_TIME in measurement.priors:
+        raise ValueError(
+            "log_likelihood has no t0: give the times since the start of the cooling, and "
+            "measurement.priors without t0"
+        )
     model.check_scene(gas)
     with jax.ensure_compile_time_eval():  # the measurement is known, where the gas is traced
         data = _data(measurement, model)

@@ -37,6 +37,9 @@ UNKNOWN_NUMBER = 1e3
 SCATTER_ERROR = 0.05
 """Relative error of the variance that theory gives to a run of N grains."""
 
+DISPLACEMENT_ERROR = "msd_err"
+"""Column of the errors of <dr^2>."""
+
 ERRORS_OF_PARTICLES = 0.1
 """Relative difference up to which T_err is taken for the fluctuation of independent samples."""
 
@@ -113,6 +116,25 @@ def errors_that_count(
     return np.hypot(np.stack([of_T, of_rotation], axis=1), rounding_errors(measurement)), notes
 
 
+def with_errors_that_count(measurement: Measurement) -> Measurement:
+    """Return a measurement whose errors are those that a fit counts, as errors of measurement."""
+    exact = replace(measurement, rounding={})
+    errors, _ = errors_that_count(exact)
+    fields: dict[str, Any] = {}
+    for column, name in enumerate(("temperature_error", "rotational_temperature_error")):
+        known = getattr(measurement.curve, name) is not None and np.any(errors[:, column] > 0)
+        fields[name] = jnp.asarray(errors[:, column]) if known else None
+    displacement = measurement.curve.displacement
+    if displacement is not None:
+        given = measurement.curve.displacement_error
+        values = np.asarray(displacement)
+        dimension = measurement.gas.dimension
+        error = _errors_of_measurement(DISPLACEMENT_ERROR, exact, given, values, dimension, [])
+        fields["displacement_error"] = jnp.asarray(error) if np.any(error > 0) else None
+    data = replace(measurement.curve, **fields)
+    return replace(measurement, data=data, errors_measured=True)
+
+
 def _used(
     measurement: Measurement,
     values: Float[np.ndarray, "times 2"],
@@ -180,9 +202,14 @@ def _errors_of_measurement(
     if given is None:
         return nothing
     error = np.asarray(given)
+    is_known = measurement.num_particles is not None or measurement.tracked is not None
     if measurement.errors_measured:
         return error
-    if measurement.replicas > 1:
+    if measurement.replicas > 1 and (is_known or name != DISPLACEMENT_ERROR):
+        notes.append(
+            f"{name} is not used: the scatter of the grains of {measurement.replicas} runs is "
+            "known. If these are errors of the measurement, say so: `errors: measured`"
+        )
         return nothing
     if measurement.tracked is not None:
         notes.append(f"{name} is not used: the sampling of {measurement.tracked} grains is known")
@@ -218,7 +245,9 @@ def _displacement(
         return None, notes
     values = np.asarray(curve.displacement)
     given = curve.displacement_error
-    errors = _errors_of_measurement("dr2_err", measurement, given, values, gas.dimension, notes)
+    errors = _errors_of_measurement(
+        DISPLACEMENT_ERROR, measurement, given, values, gas.dimension, notes
+    )
     is_measured = np.ones(values.shape, bool) if given is None else np.asarray(given) > 0
     of_grains = 0.0 if N is None else 2 / (gas.dimension * N * measurement.replicas)
     used = (values > 0) & is_measured

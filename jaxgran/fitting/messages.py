@@ -109,7 +109,7 @@ MESSAGES = {
     "outliers": "far outliers at {places}: check them and their error bars",
     "without outliers": "; without them {symbol} is {value:.3g} +- {error:.2g}",
     "errors of T": "T scatters by {percent:.2g} % more than its grains can: taken for independent "
-    "errors of T, beside which all else is fitted. Give T_err if they are known",
+    "errors of T, beside which all else is fitted. {advice}",
     "distant": "nearly every T differs from the fitted one by more than a factor of {ratio:g}: "
     "alternatives were not compared; check the units, the scale of T and T0",
     "max_steps": "the search did not converge: free fewer parameters, or in Python increase "
@@ -193,10 +193,13 @@ def with_words(
 
 def _rising(result: Fit) -> Iterator[str]:
     """Yield a clause on curves without errors that rise; scatter would be found to explain them."""
-    for m in result.measurements.values():
+    for label, m in result.measurements.items():
         if isinstance(m.data, DropTest) or m.gas.drive is not None:
             continue
+        curve = result.curve[label] if isinstance(result.curve, dict) else result.curve
         T = np.asarray(m.data.temperature)
+        if curve.temperature[-1] >= curve.temperature[0]:  # as where rotation heats it
+            continue
         trend = scipy.stats.kendalltau(np.arange(T.size), T, alternative="greater")
         if m.data.temperature_error is None and trend.pvalue < RISING_SIGNIFICANCE:
             yield say("rising", first=T[0], last=T[-1])
@@ -377,7 +380,11 @@ def _scatter(result: Fit) -> Iterator[str]:
 def _errors_of_T(result: Fit) -> Iterator[str]:
     """Yield a clause on the errors of T that a fit found in curves without errors."""
     for label, error in result.errors_of_T.items():
-        yield f"{label}: " * bool(label) + say("errors of T", percent=100 * error)
+        is_given = result.measurements[label].curve.temperature_error is not None
+        advice = "If T_err are errors of the measurement, say so: `errors: measured`"
+        advice = advice if is_given else "Give T_err if they are known"
+        prefix = f"{label}: " if label else ""
+        yield prefix + say("errors of T", percent=100 * error, advice=advice)
 
 
 def _of_each(result: Fit) -> Iterator[str]:

@@ -20,6 +20,7 @@ from jaxgran.fitting.candidates import (
     with_curve,
 )
 from jaxgran.fitting.fit import HOW_TO_MEASURE, fit
+from jaxgran.fitting.measured_rows import with_errors_that_count
 from jaxgran.fitting.report import table
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.setup import with_values_of
@@ -182,6 +183,7 @@ def plan(
     True
     """
     _check(measurement)
+    measurement = with_errors_that_count(measurement)
     listed = None if candidates is None else _of_user(candidates)
     is_planned = measurement.curve.status is not None
     base = twin(measurement) if is_planned else _at_its_fit(measurement, free)
@@ -191,7 +193,7 @@ def plan(
         raise ValueError(f"a plan needs a parameter of the gas first in free, got {names}")
     truths = truths_of(base, central)
     present = _Row(Candidate("as it is", "", _unchanged, ""), {"": base}, names)
-    present.ends[AS_GIVEN.name] = _relative(central, AS_GIVEN, base.gas)
+    present.ends[AS_GIVEN.name] = _relative(central, names[0], AS_GIVEN, base.gas)
     listed = standard_candidates(base) if listed is None else listed
     rows = _compared(listed, base, present)
     best = _best(rows)
@@ -234,7 +236,7 @@ class _Row:
         twins = {label: twin(m, truth) for label, m in self.measurements.items()}
         result = _fit(f"candidate {self.candidate.name!r}", twins, self.names)
         gas = next(iter(self.measurements.values())).gas
-        self.ends[truth.name] = _relative(result, truth, gas)
+        self.ends[truth.name] = _relative(result, self.names[0], truth, gas)
 
     def width(self, truth: str) -> float:
         """Return the width of the range for a truth, over the true value; `OPEN_WIDTH` at most."""
@@ -365,24 +367,32 @@ def _fit(name: str, measurements: dict[str, Measurement], free: Any, quick: bool
         raise type(error)(f"{name}: {error}") from None
 
 
-def _relative(result: Fit, truth: Truth, gas: Gas) -> tuple[float, float]:
-    """Return the range of the first parameter over its true value; 0 to inf if there is none."""
-    name = result.names[0]
-    if name not in result.ranges:
+def _relative(result: Fit, name: str, truth: Truth, gas: Gas) -> tuple[float, float]:
+    """Return the range of a parameter over its true value; 0 to inf if there is none.
+
+    If each of several curves has the parameter for itself, that of the first curve counts.
+    """
+    titles = [title for title in result.ranges if title.rpartition(": ")[2] == name]
+    if not titles:
         return 0.0, float("inf")
-    low, high = (float(np.ravel(x)[0]) for x in result.ranges[name])
+    low, high = (float(np.ravel(x)[0]) for x in result.ranges[titles[0]])
     true = float(np.ravel(truth.gas(gas).value(name))[0])
     return low / true, high / true
 
 
 def _at_its_fit(measurement: Measurement, free: Any) -> Measurement:
-    """Return a measurement with the values of its fit; its errors remain, relative to these."""
+    """Return a measurement with the values of its fit.
+
+    Its errors remain, relative to these; those that the fit found are added.
+    """
     found = _fit(DATA, {"": measurement}, free, quick=True)
     fields = {}
     for name in ("temperature", "rotational_temperature", "displacement"):
         fitted = getattr(found.curve, name)
         if getattr(measurement.curve, name) is not None and fitted is not None:
             fields[name] = np.asarray(fitted)
+    if found.errors_of_T:
+        fields["temperature_error"] = found.errors_of_T[""] * fields["temperature"]
     base = replace(measurement, gas=found.gas, rounding={}, header=())
     return twin(with_curve(base, **fields))
 

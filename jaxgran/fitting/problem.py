@@ -129,6 +129,11 @@ class Problem:
         """The measured curves."""
         return tuple(m for m in self.measurements if isinstance(m, CurveRows))
 
+    def fixed_with(self, values: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+        """Return the fixed values with further ones, by label and name."""
+        labels = {*self.fixed, *values}
+        return {label: self.fixed.get(label, {}) | values.get(label, {}) for label in labels}
+
     def holding(self, name: str) -> tuple["Problem", np.ndarray]:
         """Return the problem with the unknowns of a name held at 0, and which ones are left."""
         unknowns = tuple(u for u in self.unknowns if u.name != name)

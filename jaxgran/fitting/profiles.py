@@ -95,7 +95,7 @@ def profile_of(problem: Problem, kind: Kind, base: Trial, origin: np.ndarray) ->
 
     def fit_with(amplitude: float, first: np.ndarray) -> Trial | None:
         added = kind.values_by_label(problem, amplitude)
-        fixed = {label: problem.fixed.get(label, {}) | own for label, own in added.items()}
+        fixed = problem.fixed_with(added)
         changed = with_wider_rate_error(problem, kind.rate_error(amplitude))
         return trial_of(replace(changed, fixed=fixed), amplitude, first, origin)
 

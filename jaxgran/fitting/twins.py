@@ -15,10 +15,11 @@ from jaxgran.fitting.kinds import (
     ROUGHNESS_ADDED,
     WALL_RESTITUTION,
     WALLS_ADDED,
+    initial_rate,
     side_of_walls,
 )
 from jaxgran.fitting.measured_rows import finite_size_cooling_factor
-from jaxgran.fitting.parameters import as_floats, halving_time, with_parameters
+from jaxgran.fitting.parameters import as_floats, with_parameters
 from jaxgran.fitting.prediction import times_with_nodes
 from jaxgran.fitting.result import Fit
 from jaxgran.models.kinetic_theory import KineticTheory
@@ -30,8 +31,8 @@ from jaxgran.scene.parameters import symbol_of
 PARAMETER_SHIFT = float(np.log(1.5))
 """Shift of the first parameter of a truth, in the unconstrained scale: A is a guess."""
 
-RATE_OF_HALVING = 0.86
-"""Cooling rate at the start, over the inverse of the time in which T halves."""
+RATE_TIMES = np.geomspace(1e-2, 1e4, 100)
+"""Times of the curve from which a cooling rate is taken, in mean free times."""
 
 NUM_EFFECTS = 2
 """Number of truths that contain an effect of which the fit is not informed."""
@@ -92,12 +93,12 @@ def truths_of(measurement: Measurement, result: Fit) -> list[Truth]:
         shifts = {name: sign * shift for name, shift in known.items()}
         shifts |= {first: sign * PARAMETER_SHIFT} if first in gas.domains else {}
         truths.append(Truth(f"{words} {symbol_of(first)}", shifts))
-    rate = RATE_OF_HALVING / halving_time(measurement.curve)
+    rate = _cooling_rate(gas)
     effects = [_with_effect(x, x.allowed[1] / 2, gas, rate) for x in _widening(result)]
     return truths + [truth for truth in effects if truth is not None][:NUM_EFFECTS]
 
 
-def strongest_effect(result: Fit) -> tuple[Truth, dict[str, float]] | None:
+def strongest_effect(result: Fit) -> tuple[Truth, dict[str, np.ndarray]] | None:
     """Return a gas with the effect that the data prefer, or that widens the range most.
 
     Args:
@@ -107,18 +108,34 @@ def strongest_effect(result: Fit) -> tuple[Truth, dict[str, float]] | None:
         The truth, and values of the free parameters with it; None without such an effect.
     """
     gas = result.gas
-    rate = RATE_OF_HALVING / halving_time(result.curve)
+    rate = _cooling_rate(gas)
     for alternative in result.alternatives:
         truth = _with_effect(alternative, alternative.amplitude, gas, rate)
         if alternative.preferred and truth is not None:
-            names = [name for name in result.names if name in gas.domains]
-            values = zip(result.names, alternative.estimate.tolist(), strict=False)
-            return truth, {name: x for name, x in values if name in names}
+            return truth, _values_by_name(result, alternative.estimate)
     for alternative in _widening(result):
         truth = _with_effect(alternative, alternative.allowed[1] / 2, gas, rate)
         if truth is not None:
             return truth, {}
     return None
+
+
+def _cooling_rate(gas: Gas) -> float:
+    """Return the cooling rate of a gas at the start, 1/s, as amplitudes of alternatives mean it."""
+    times = np.append(0.0, RATE_TIMES * float(gas.mean_free_time))
+    curve = curve_of_program(KineticTheory().simplified_for(gas), gas, times)
+    T = np.asarray(curve.temperature)
+    return initial_rate(times, np.log(T / T[0]))
+
+
+def _values_by_name(result: Fit, estimate: np.ndarray) -> dict[str, np.ndarray]:
+    """Return values of the free parameters of the gas, by name."""
+    names = np.asarray(result.names_of_elements)
+    return {
+        name: estimate[names == name].reshape(np.shape(result.gas.value(name)))
+        for name in result.names
+        if name in result.gas.domains
+    }
 
 
 def _widening(result: Fit) -> list[Alternative]:
@@ -152,7 +169,7 @@ def _with_effect(alternative: Alternative, amplitude: float, gas: Gas, rate: flo
 def twin(measurement: Measurement, truth: Truth = AS_GIVEN) -> Measurement:
     """Return a measurement with the values of kinetic theory for a truth, without noise.
 
-    The relative errors are taken from the given values.
+    The relative errors are taken from the given values; errors of values below 0 remain.
 
     Args:
         measurement: of a curve or a drop test.
@@ -184,8 +201,8 @@ def twin(measurement: Measurement, truth: Truth = AS_GIVEN) -> Measurement:
             continue
         fields[name] = np.asarray(getattr(curve, name))[place]
         if error is not None:
-            relative = np.asarray(error) / np.where(given > 0, given, 1.0)
-            fields[f"{name}_error"] = relative * fields[name]
+            scale = np.where(given > 0, fields[name] / np.where(given > 0, given, 1.0), 1.0)
+            fields[f"{name}_error"] = np.asarray(error) * scale
     known = as_jax_arrays({"times": np.asarray(data.times)} | fields)
     data = dataclasses.replace(data, **known)
     return replace(measurement, data=data, of_energy=False)

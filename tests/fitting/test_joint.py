@@ -10,6 +10,7 @@ import pytest
 import jaxgran
 from jaxgran import read_measurement
 from jaxgran.fitting.kinds import WALLS_ADDED
+from jaxgran.fitting.setup import Request, build_problem
 from jaxgran.scene.laws import ViscoelasticVariant
 from tests.beads import glass_beads
 from tests.data.curve_files import IN_MM, PLAIN, TIMES, T, text_of
@@ -206,3 +207,17 @@ def test_an_effect_that_one_curve_tells_stays_possible_in_another():
     both = jaxgran.fit({"free": free, "other": other}, progress=False)
     assert any(x.effect == "walls" for x in both.alternatives)
     assert any("walls (free)" in reason for reason in both.reasons)
+
+
+def test_a_second_effect_of_one_curve_keeps_the_first_one_of_the_others():
+    gas = glass_beads(0.1)
+    measurements = {
+        "a": jaxgran.Measurement(gas, synthetic(gas), num_particles=300),
+        "b": jaxgran.Measurement(gas, synthetic(gas, num_points=30), num_particles=300),
+    }
+    request = Request(measurements, jaxgran.KineticTheory(), (A,), (), {}, None, quick=True)
+    problem, _, _ = build_problem(request)
+    known = {label: {"wall_coefficient": 0.5} for label in measurements}
+    problem = dataclasses.replace(problem, fixed=known)
+    both = problem.fixed_with({"a": {"drag_rate": 0.1}})
+    assert both["a"] == {"wall_coefficient": 0.5, "drag_rate": 0.1} and both["b"] == known["b"]

@@ -7,7 +7,10 @@ import pytest
 
 import jaxgran
 from jaxgran.fitting import candidates
-from jaxgran.fitting.twins import Truth, twin
+from jaxgran.fitting.kinds import initial_rate
+from jaxgran.fitting.measured_rows import with_errors_that_count
+from jaxgran.fitting.plan import _at_its_fit
+from jaxgran.fitting.twins import Truth, _cooling_rate, twin
 from tests.beads import glass_beads, without
 
 TIMES = np.geomspace(0.1, 10.0, 10)
@@ -67,6 +70,9 @@ def test_additions_change_what_they_say():
     assert np.allclose(error, SMOOTH.curve.temperature_error / 2**0.5)
     boxed = candidates.in_larger_box(BOXED)
     assert boxed.num_particles == 2000 and np.isclose(boxed.gas.value("wall_side"), 0.1)
+    measured = dataclasses.replace(BOXED, priors={"wall_side": (0.05, 0.001)})
+    side, error = candidates.in_larger_box(measured).priors["wall_side"]
+    assert np.allclose((side, error), (0.1, 0.002))
     known = candidates.with_prior(ROUGH, "tangential_restitution", 0.1).priors
     assert float(known["tangential_restitution"][1]) == 0.1
     dense = candidates.with_second_density(SMOOTH)["second density"]
@@ -76,6 +82,37 @@ def test_additions_change_what_they_say():
         planned(glass_beads(packing_fraction=0.12), priors={"packing_fraction": (0.12, 0.006)})
     )["second density"]
     assert np.isclose(thin.priors["packing_fraction"][1], 0.002)
+
+
+def test_only_errors_that_a_fit_counts_are_planned():
+    """Errors by the grains stay out of a plan, whatever changes; errors of a fit belong to it."""
+    of_grains = planned(error=(2 / 3 / 250) ** 0.5, errors_measured=False)
+    counted = with_errors_that_count(of_grains)
+    assert counted.curve.temperature_error is None and candidates.with_errors(counted) is None
+    assert with_errors_that_count(SMOOTH).curve.temperature_error is not None
+    noise = np.exp(0.05 * np.random.default_rng(0).normal(size=TIMES.size))
+    noisy = jaxgran.CoolingCurve(TIMES, noise * SMOOTH.curve.temperature)
+    base = _at_its_fit(jaxgran.Measurement(GAS, noisy, num_particles=10**5), None)
+    relative = np.asarray(base.curve.temperature_error / base.curve.temperature)
+    assert np.allclose(relative, relative[0]) and 0.02 < relative[0] < 0.1
+
+
+@pytest.mark.slow
+def test_a_plan_of_T_0_gives_its_range_with_a_second_density():
+    """T_0 belongs to each curve there, and A comes first in that fit."""
+    changes = {"second density": candidates.with_second_density}
+    free = ("temperature", "dissipative_constant")
+    found = jaxgran.plan(SMOOTH, candidates=changes, free=free)
+    (second,) = found.additions
+    assert found.parameter == "temperature"
+    assert second.gain > 0.5 and second.width < 2 * found.present.width
+
+
+def test_amplitudes_of_effects_do_not_depend_on_the_first_row():
+    """The rate to which drag and walls refer is the rate at the start of the gas."""
+    for times in (TIMES, np.linspace(3.0, 10.0, 8)):
+        log_T = np.log(np.asarray(jaxgran.cool(GAS, times).temperature) / float(GAS.temperature))
+        assert initial_rate(times, log_T) == pytest.approx(_cooling_rate(GAS), rel=0.05)
 
 
 def test_additions_keep_the_labels_of_a_user():

@@ -121,7 +121,6 @@ def impact_effect(
             eta = surface.eta if axis is None else surface.eta_on_wall(material.walls.surface)
             spin_factor = decay.spin_over_velocity[:, None]
             spin = impact.spin * spin_factor
-            push = -jnp.sum(kick * impact.normal, -1)
             sideways, sliding_kick, added_spin = tangential_impulse(
                 impact.relative, spin, impact.normal, ~impact.elastic, eta, surface, push
             )
