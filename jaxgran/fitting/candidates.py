@@ -60,13 +60,13 @@ IMPACT_ANGLES = (10.0, 75.0)
 IMPACT_SPEEDS = (0.3, 3.0)
 """Slowest and fastest impact, over the thermal speed sqrt(2 T) of the start."""
 
-PRICES = {
+HOW_TO_SHOW_ABSENCE = {
     "walls": "a box so large, or a time so short, that no grain meets a wall twice",
     "roughness": "marked grains that do not begin to rotate",
     "drag": "a vacuum: below some 1 Pa for grains of 1 mm",
     "friction": "grains that do not slide at oblique impacts",
 }
-"""What shows that an effect is absent."""
+"""What shows that an effect is absent, which is the price of its declaration."""
 
 
 class Candidate(NamedTuple):
@@ -143,7 +143,7 @@ def standard_candidates(measurement: Measurement) -> list[Candidate]:
         ),
         *(
             Candidate(f"no {name}: declared", price, partial(with_absence, effect=name), name)
-            for name, price in PRICES.items()
+            for name, price in HOW_TO_SHOW_ABSENCE.items()
         ),
     ]
     return [candidate for candidate in found if candidate.change(measurement) is not None]

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -48,38 +48,64 @@ DISTANT_SHARE = 0.8
 """Share of such values: where T has fallen most, a curve in another unit may come near."""
 
 
+class _Ends(NamedTuple):
+    """Where the searches of a fit end.
+
+    Attributes:
+        problem: of the fit, with the errors of T that the data show.
+        best: the deepest minimum.
+        minima: all minima.
+        given: the problem without these errors, with the errors of the cooling rate.
+        goodness: of the fit without these errors.
+    """
+
+    problem: Problem
+    best: Minimum
+    minima: list[Minimum]
+    given: Problem
+    goodness: dict[str, Any]
+
+
 def fit_without_noise(request: Request, max_steps: int, descent: Descent | None = None) -> Fit:
     """Fit a model without noise, starting at the best of some guesses."""
     problem, first, notes = build_problem(request)
     problem.check_points()
-    if descent is None:
-        problem, best, minima = _found_by_two_searches(problem, first, max_steps)
-    else:  # it keeps the errors of the cooling rate that it began with
-        best, minima = best_of_starts(problem, first, max_steps, descent)
-    check_computed(problem, best)
+    ends = _search(problem, first, max_steps, descent)
+    found = ends.problem.evaluate(ends.best.flat)
+    distant = distant_curves(ends.problem, found)
     explanations = None
-    given = problem
-    of_law = goodness(given, given.evaluate(best.flat))
-    if descent is None and (of_law["p_value"] < SIGNIFICANCE or not best.converged):
-        has_ended = best.converged
-        problem, best, minima = _with_errors_of_T(problem, first, best, minima, max_steps)
-        if not has_ended:
-            of_law = goodness(given, given.evaluate(best.flat[: first.size]))
-    distant = distant_curves(problem, problem.evaluate(best.flat))
-    if distant:
-        notes = [*notes, say("distant", ratio=MAX_DISTANCE)]
-    elif best.converged and not request.quick:
+    if ends.best.converged and not (request.quick or distant):
         is_driven = any(m.scene.drive is not None for m in problem.curves)
         noise = np.zeros(problem.num_free)
-        explanations = compare_alternatives(problem, minima, noise, is_driven)
-    result = replace(assembled(request, problem, best, minima, explanations), **of_law)
-    share = measurement_share(problem, problem.evaluate(best.flat))
-    if result.p_value < SIGNIFICANCE and not request.quick and not distant:
-        notes += _outlier_notes(given, first, max_steps)
-    scatter = problem.evaluate(best.flat).scatter_of_eps
-    if scatter is not None:
-        notes = [*notes, say("scatter of eps", scatter=scatter)]
+        explanations = compare_alternatives(ends.problem, ends.minima, noise, is_driven)
+    result = assembled(request, ends.problem, ends.best, ends.minima, explanations)
+    result = replace(result, **ends.goodness)
+    if distant:
+        notes.append(say("distant", ratio=MAX_DISTANCE))
+    elif result.p_value < SIGNIFICANCE and not request.quick:
+        notes += _outlier_notes(ends.given, first, max_steps)
+    if found.scatter_of_eps is not None:
+        notes.append(say("scatter of eps", scatter=found.scatter_of_eps))
+    share = measurement_share(ends.problem, found)
     return with_messages(request, result, explanations, notes, share)
+
+
+def _search(problem: Problem, first: np.ndarray, max_steps: int, descent: Descent | None) -> _Ends:
+    """Return where the searches end, with errors of T if the data show them."""
+    if descent is not None:  # it keeps the errors of the cooling rate that it began with
+        best, minima = best_of_starts(problem, first, max_steps, descent)
+        check_computed(problem, best)
+        return _Ends(problem, best, minima, problem, goodness(problem, problem.evaluate(best.flat)))
+    given, best, minima = _found_by_two_searches(problem, first, max_steps)
+    check_computed(given, best)
+    known = goodness(given, given.evaluate(best.flat))
+    if best.converged and known["p_value"] >= SIGNIFICANCE:
+        return _Ends(given, best, minima, given, known)
+    has_ended = best.converged
+    problem, best, minima = _with_errors_of_T(given, first, best, minima, max_steps)
+    if not has_ended:
+        known = goodness(given, given.evaluate(best.flat[: first.size]))
+    return _Ends(problem, best, minima, given, known)
 
 
 def _with_errors_of_T(

@@ -21,6 +21,9 @@ from jaxgran.scene.parameters import symbol_of, unit_of
 RISING_SIGNIFICANCE = 0.05
 """Level at which T is found to rise: of four rising values the probability by chance is 0.04."""
 
+NARROWING_LOSS = 5.0
+"""Increase of -2 ln L beyond which explanations without some effects do not explain the data."""
+
 NEGLIGIBLE_SHARE = 0.01
 """Share of an estimate below which the low end of a range counts as 0."""
 
@@ -253,7 +256,7 @@ def _narrowing(result: Fit, explanations: Explanations) -> str:
     excluded = [x for x in explanations.alternatives if x.effect in effects]
     others = [x for x in (explanations.law, *explanations.alternatives) if x not in excluded]
     best = max(x.improvement for x in (explanations.law, *explanations.alternatives))
-    if not wide or max(x.improvement for x in others) < best - 2 * NARROWING_LOSS:
+    if not wide or max(x.improvement for x in others) < best - NARROWING_LOSS:
         return ""
     low, high = explanations.ranges(without=excluded)
     widest_low, widest_high = explanations.ranges()
@@ -267,11 +270,6 @@ def _narrowing(result: Fit, explanations: Explanations) -> str:
         names=", ".join(effects),
         given=", ".join(DECLARABLE[effect][1] for effect in effects),
     )
-
-
-NARROWING_LOSS = 2.5
-"""Half of the increase of -2 ln L beyond which explanations without some effects do not explain the
-data."""
 
 
 def _verdict(result: Fit, is_misfit: bool, limitations: tuple[Limitation, ...]) -> tuple[str, str]:
