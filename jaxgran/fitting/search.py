@@ -143,9 +143,9 @@ def minimise(
     objective = _Objective(problem, first if origin is None else origin)
     first = objective.nearest(first)
     if not np.isfinite(objective.value(first)):
-        return Minimum(first, np.inf, 0, False)
+        return Minimum(first, np.inf, steps=0, converged=False)
     if objective.newton_length(first) < tolerance:
-        return Minimum(first, objective.value(first), 0, True)
+        return Minimum(first, objective.value(first), steps=0, converged=True)
     ending = _Ending(objective, tolerance)
     solution = scipy.optimize.minimize(
         objective.value,
@@ -398,6 +398,8 @@ class Descent:
             try:
                 return compiled(*arguments)
             except TypeError as error:
+                if "missing" not in str(error):
+                    raise
                 raise ValueError(
                     "this transformation of optax needs more than gradients, such as a line "
                     "search. Use optax.adam(0.05)"

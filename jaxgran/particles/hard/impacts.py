@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxgran.gradients.tangents import ExchangeTangents
-from jaxgran.particles.elements import drag_decay, tangential_impulse
+from jaxgran.particles.elements import DragDecay, drag_decay, tangential_impulse
 from jaxgran.particles.hard.prediction import (
     FirstImpacts,
     ImpactCandidates,
@@ -99,44 +99,77 @@ def impact_effect(
     energies at walls have a factor of value 1 that carries this dependence.
     """
     material = scene.material
-    speed = impact.speed
-    law = material.law
-    surface = material.surface
-    share = 0.5
-    if axis is not None:
-        law = material.walls.law
-        share = 1.0  # a wall takes no part of the change of velocity
+    law = material.law if axis is None else material.walls.law
+    share = 0.5 if axis is None else 1.0  # a wall takes no part of the change of velocity
     decay = drag_decay(scene.drag_rates, impact.time)
-    law_speed = speed * 0.5**0.5  # the law's unit of speed is sqrt(2)
+    law_speed = impact.speed * 0.5**0.5  # the law's unit of speed is sqrt(2)
     eps = law.restitution(law_speed * decay.velocity)
     eps = jnp.where(impact.elastic, 1.0, eps)
-    push = share * (1 + eps) * speed
-    kick = -push[:, None] * impact.normal
-    lost = share**2 / 2 * (1 - eps**2) * speed**2
-    spin_change = rotational_gain = None
-    if surface is not None and impact.spin is not None:
-        spin_change = jnp.zeros_like(impact.spin)
-        rotational_gain = spin_change[:, 0]
-        if axis is None or material.walls.surface is not None:
-            eta = surface.eta if axis is None else surface.eta_on_wall(material.walls.surface)
-            spin_factor = decay.spin_over_velocity[:, None]
-            spin = impact.spin * spin_factor
-            sideways, sliding_kick, added_spin = tangential_impulse(
-                impact.relative, spin, impact.normal, ~impact.elastic, eta, surface, push
-            )
-            with_half = sideways + 0.5 / share * sliding_kick
-            kick = kick + sliding_kick
-            lost = lost - share * jnp.sum(sliding_kick * with_half, -1)
-            spin_change = added_spin / spin_factor
-            before_and_after = impact.spin * 2 * share + spin_change
-            rotational_gain = surface.inertia / 2 * jnp.sum(spin_change * before_and_after, -1)
-    if axis is not None:
-        frequency = material.walls.frequency[axis]
-        frequency = frequency * wall_impact_ratio(eps, frequency, impact.normal.shape[1])
-        weight = frequency / jax.lax.stop_gradient(frequency)
-        lost = lost * weight
-        rotational_gain = None if rotational_gain is None else rotational_gain * weight
-    return ImpactEffect(kick, lost, spin_change, rotational_gain)
+    push = share * (1 + eps) * impact.speed
+    lost = share**2 / 2 * (1 - eps**2) * impact.speed**2
+    effect = ImpactEffect(-push[:, None] * impact.normal, lost)
+    if material.surface is not None and impact.spin is not None:
+        effect = _with_tangential_part(effect, material, impact, impact.spin, axis, push, decay)
+    if axis is None:
+        return effect
+    frequency = material.walls.frequency[axis]
+    frequency = frequency * wall_impact_ratio(eps, frequency, impact.normal.shape[1])
+    weight = frequency / jax.lax.stop_gradient(frequency)
+    gain = effect.rotational_gain
+    gain = None if gain is None else gain * weight
+    return effect._replace(lost=effect.lost * weight, rotational_gain=gain)
+
+
+def _with_tangential_part(
+    effect: ImpactEffect,
+    material: ReducedScene,
+    impact: ImpactEvents,
+    spin: Float[Array, "rows spins"],
+    axis: Int[Array, "rows"] | None,
+    push: Float[Array, "rows"],
+    decay: DragDecay,
+) -> ImpactEffect:
+    """Return the effect of an impact of rough spheres from its normal part.
+
+    With the share s of a sphere, 1/2 of two spheres and 1 at a wall, the tangential kick k changes
+    the energy by ``s k (v + k/(2 s))`` for each sphere, v being the tangential part of the relative
+    velocity, and the change c of the spin changes it by ``I c (2 s w + c)/2``, w being the spin, or
+    the sum of both.
+
+    Args:
+        effect: of the normal part.
+        material, impact, axis: see `impact_effect`.
+        spin: of the impact.
+        push: normal change of velocity of the first sphere.
+        decay: by drag until the impact.
+    """
+    surface = material.surface
+    spin_change = jnp.zeros_like(spin)
+    gain = spin_change[:, 0]
+    if axis is not None and material.walls.surface is None:
+        return effect._replace(spin_change=spin_change, rotational_gain=gain)
+    share = 0.5 if axis is None else 1.0
+    eta = surface.eta if axis is None else surface.eta_on_wall(material.walls.surface)
+    spin_factor = decay.spin_over_velocity[:, None]
+    sideways, kick, added_spin = tangential_impulse(
+        impact.relative,
+        spin * spin_factor,
+        impact.normal,
+        ~impact.elastic,
+        eta,
+        surface,
+        push,
+    )
+    with_half = sideways + 0.5 / share * kick
+    spin_change = added_spin / spin_factor
+    before_and_after = spin * 2 * share + spin_change
+    gain = surface.inertia / 2 * jnp.sum(spin_change * before_and_after, -1)
+    return ImpactEffect(
+        kick=effect.kick + kick,
+        lost=effect.lost - share * jnp.sum(kick * with_half, -1),
+        spin_change=spin_change,
+        rotational_gain=gain,
+    )
 
 
 def exchange_gains(
