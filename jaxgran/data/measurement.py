@@ -56,7 +56,8 @@ class Measurement(eqx.Module):
             single collisions and due to a flow that grows in the box, and corrects a model without
             noise for the faster cooling of few particles (a particle model needs as many particles
             as were measured).
-        replicas: number of runs over which the curve is a mean.
+        replicas: number of runs over which the curve is a mean. Errors of such a mean come from the
+            grains and are left out, unless `errors_measured`.
         priors: known values and standard errors, SI, by name, as
             ``{"packing_fraction": (0.05, 0.002)}``: of parameters of the gas, of "density", which
             lets the mass vary, or of "t0". Each is Gaussian in the unconstrained scale (the

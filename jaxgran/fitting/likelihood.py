@@ -165,24 +165,24 @@ def _likelihood_of_temperatures(gas: Gas, nodes: Nodes, data: _Data) -> Float[Ar
     logs = _log_measured(gas, nodes, rows.measurement.of_energy)
     residuals = log_ratio(observed.values, logs, observed.errors)
     variances = (observed.errors / jnp.exp(logs)) ** 2
-    factors = {name: x for name, x in COMMON_FACTORS.items() if name in rows.nuisances}
-    shapes = [jnp.broadcast_to(jnp.asarray(x), residuals.shape) for x in factors.values()]
-    widths = jnp.asarray([rows.nuisances[name] for name in factors])
+    common_factors = {name: x for name, x in COMMON_FACTORS.items() if name in rows.nuisances}
+    shapes = [jnp.broadcast_to(jnp.asarray(x), residuals.shape) for x in common_factors.values()]
+    widths = jnp.asarray([rows.nuisances[name] for name in common_factors])
     is_known = rows.measurement.num_particles is not None
     steps = STEPS_OF_KNOWN_N if is_known else STEPS_OF_UNKNOWN_N
     factors_of_N = jnp.exp(rows.grains.log_error * steps)
 
-    def for_each(x: Any) -> Any:
+    def with_axis_of_N(x: Any) -> Any:
         """Return an array with a last axis, of values of N."""
         return None if x is None else jnp.broadcast_to(x[..., None], (*x.shape, steps.size))
 
-    each = Nodes(*(for_each(x) for x in nodes))
+    each = Nodes(*(with_axis_of_N(x) for x in nodes))
     values, spread = filtered(
         jax.tree.map(lambda x: jnp.broadcast_to(x, (steps.size, *jnp.shape(x))), gas),
         each._replace(times=nodes.times, sonine=nodes.sonine),
-        for_each(jnp.stack([residuals, *shapes], axis=-1)),
-        for_each(variances),
-        for_each(jnp.ones_like(nodes.log_temperature)),
+        with_axis_of_N(jnp.stack([residuals, *shapes], axis=-1)),
+        with_axis_of_N(variances),
+        with_axis_of_N(jnp.ones_like(nodes.log_temperature)),
         observed.used,
         jax.tree.map(jnp.asarray, rows.noise(data.times, factors_of_N)),
         differentiable=True,

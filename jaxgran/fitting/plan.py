@@ -255,15 +255,15 @@ class _Row:
         gas = next(iter(present.measurements.values())).gas
         scale = float(np.ravel(gas.value(self.names[0]))[0])
         return Expected(
-            self.candidate.name,
-            self.candidate.price,
-            low * scale,
-            high * scale,
-            self.width(AS_GIVEN.name),
-            float(np.median(widths)),
-            min(widths),
-            max(widths),
-            self.gain(present),
+            name=self.candidate.name,
+            price=self.candidate.price,
+            low=low * scale,
+            high=high * scale,
+            width=self.width(AS_GIVEN.name),
+            median=float(np.median(widths)),
+            smallest=min(widths),
+            largest=max(widths),
+            gain=self.gain(present),
         )
 
 
