@@ -17,7 +17,8 @@ from jaxgran.models.particle_model import AbstractParticleModel
 from jaxgran.particles.dsmc.collisions import Scheme
 from jaxgran.particles.dsmc.dynamics import DSMCDynamics
 from jaxgran.particles.snapshot import Units
-from jaxgran.scene.gas import Gas, ReducedScene, reduced_scene
+from jaxgran.scene.gas import Gas
+from jaxgran.scene.reduced import ReducedScene, reduced_scene
 
 MAX_STEP = 0.1
 """Largest number of collisions per particle and step: a step draws a particle at most twice."""

@@ -25,8 +25,9 @@ from jaxgran.particles.hard.dynamics import (
     allowed_overlap,
 )
 from jaxgran.particles.hard.impacts import LawOfReplicas
-from jaxgran.scene.gas import Gas, SphereScene, reduced_scene, sphere_scene
+from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import wrapped
+from jaxgran.scene.reduced import SphereScene, reduced_scene, sphere_scene
 from jaxgran.theory.averages import collision_rate
 
 WINDOW_SHARE = 0.05

@@ -24,7 +24,8 @@ from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.models.scales import first_cooling_rate
-from jaxgran.scene.gas import Gas, reduced_scene
+from jaxgran.scene.gas import Gas
+from jaxgran.scene.reduced import reduced_scene
 from jaxgran.theory.covariance import run_covariance
 from jaxgran.theory.density import Density, softness_factor
 from jaxgran.theory.elements import SUPPORTED

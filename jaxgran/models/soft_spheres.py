@@ -20,8 +20,10 @@ from jaxgran.particles.capacity import capacities, grid, round_up
 from jaxgran.particles.soft.dynamics import SoftDynamics
 from jaxgran.scene.contact import elastic_constant
 from jaxgran.scene.elements import Frictional
-from jaxgran.scene.gas import (
-    Gas,
+from jaxgran.scene.gas import Gas
+from jaxgran.scene.geometry import wrapped
+from jaxgran.scene.laws import Viscoelastic
+from jaxgran.scene.reduced import (
     ReducedContact,
     ReducedFriction,
     ReducedScene,
@@ -29,8 +31,6 @@ from jaxgran.scene.gas import (
     SphereScene,
     sphere_scene,
 )
-from jaxgran.scene.geometry import wrapped
-from jaxgran.scene.laws import Viscoelastic
 
 PROJECTION = 0.1
 """Mean free times between thermal projections of a derivative."""

@@ -25,7 +25,8 @@ from jaxgran.particles.neighbours import check_engine, choose_engine
 from jaxgran.particles.snapshot import Units
 from jaxgran.particles.spheres import AbstractSphereDynamics
 from jaxgran.particles.start import check_inside, check_start
-from jaxgran.scene.gas import Gas, SphereScene
+from jaxgran.scene.gas import Gas
+from jaxgran.scene.reduced import SphereScene
 
 DIFFERENCE_STEPS = Domain(0.0, 0.5, high_allowed=True)
 """Allowed steps of differences: the lower value of alpha must stay positive."""

@@ -20,7 +20,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, UInt32
 
 from jaxgran.gradients.tangents import ExchangeTangents
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
-from jaxgran.scene.gas import ReducedDrag, ReducedRough
+from jaxgran.scene.reduced import ReducedDrag, ReducedRough
 
 
 class DragDecay(NamedTuple):

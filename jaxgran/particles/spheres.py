@@ -29,8 +29,8 @@ from jaxgran.particles.start import (
     normalised_velocities,
 )
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
-from jaxgran.scene.gas import SphereScene
 from jaxgran.scene.geometry import MIN_BOX
+from jaxgran.scene.reduced import SphereScene
 
 S = TypeVar("S", bound="AbstractSphereDynamics")
 

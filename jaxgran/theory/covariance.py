@@ -43,7 +43,8 @@ from jaxtyping import Array, Float
 
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS, wall_impact_ratio
-from jaxgran.scene.gas import Gas, ReducedRough, ReducedScene, ReducedWalls, reduced_scene
+from jaxgran.scene.gas import Gas
+from jaxgran.scene.reduced import ReducedRough, ReducedScene, ReducedWalls, reduced_scene
 from jaxgran.theory.averages import (
     collision_rate,
     loss_moments,

@@ -10,10 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME
-from jaxgran.scene.gas import (
-    Gas,
-    scaled_critical_wavenumber,
-)
+from jaxgran.scene.gas import Gas, scaled_critical_wavenumber
 from jaxgran.scene.geometry import contact_value_slopes, sphere_surface
 from jaxgran.scene.laws import ReducedLaw
 

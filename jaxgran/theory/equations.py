@@ -17,11 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxgran.scene.gas import (
-    ReducedScene,
-)
 from jaxgran.scene.geometry import sphere_surface
 from jaxgran.scene.laws import C1
+from jaxgran.scene.reduced import ReducedScene
 from jaxgran.theory.averages import (
     TERMS,
     RateTable,

@@ -31,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from jaxgran.scene.gas import PAIRS, ReducedSizes
+from jaxgran.scene.reduced import PAIRS, ReducedSizes
 from jaxgran.theory.averages import collision_rate, loss_nodes
 
 _MEMBERS = np.array([[[1, 1], [0, 0]], [[1, 0], [0, 1]], [[0, 0], [1, 1]]], float)

@@ -12,11 +12,8 @@ import optimistix as optx
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxgran.scene.gas import (
-    Gas,
-    ReducedScene,
-    reduced_scene,
-)
+from jaxgran.scene.gas import Gas
+from jaxgran.scene.reduced import ReducedScene, reduced_scene
 from jaxgran.theory.averages import (
     impact_moments,
 )

@@ -9,7 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran.particles.elements import flight_time, true_duration
-from jaxgran.scene.gas import ReducedDrag
+from jaxgran.scene.reduced import ReducedDrag
 from tests.beads import hard_gas
 
 

@@ -10,7 +10,7 @@ import pytest
 
 import jaxgran
 from jaxgran.models.linearise import with_neutral_elements
-from jaxgran.scene.gas import reduced_scene
+from jaxgran.scene.reduced import reduced_scene
 from jaxgran.theory import covariance
 from jaxgran.theory.averages import loss_moments, rough_energy_moments
 from jaxgran.theory.density import Density

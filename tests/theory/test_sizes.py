@@ -11,7 +11,7 @@ import jaxgran
 from jaxgran._utils.tracing import fast_jit
 from jaxgran.fitting.innovations import Nodes, filtered
 from jaxgran.fitting.rows import Noise
-from jaxgran.scene.gas import reduced_scene
+from jaxgran.scene.reduced import reduced_scene
 from jaxgran.theory import sizes
 from jaxgran.theory.density import Density
 from jaxgran.theory.equations import Equations

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt, UInt32
 
 from jaxgran.particles.elements import tangential_impulse
-from jaxgran.scene.gas import ReducedScene
 from jaxgran.scene.geometry import sphere_surface
+from jaxgran.scene.reduced import ReducedScene
 
 CEILING = 5.0
 """Relative speed, in sqrt(2 T), up to which the collision rate is right; beyond it is constant.

@@ -55,7 +55,7 @@ from jaxgran.particles.elements import (
 )
 from jaxgran.particles.start import maxwellian_spins, maxwellian_velocities
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS, wall_impact_ratio
-from jaxgran.scene.gas import ReducedScene
+from jaxgran.scene.reduced import ReducedScene
 from jaxgran.theory.averages import collision_rate
 
 FASTEST_SPEED = 3.5

@@ -47,7 +47,7 @@ from jaxgran.particles.spheres import (
 )
 from jaxgran.particles.start import initial_spins
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
-from jaxgran.scene.gas import ReducedScene, SphereScene
+from jaxgran.scene.reduced import ReducedScene, SphereScene
 
 MIN_IMPACTS = 8
 """Smallest number of impacts that a window should have, in all replicas together."""

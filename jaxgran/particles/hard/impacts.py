@@ -27,8 +27,8 @@ from jaxgran.particles.hard.prediction import (
 )
 from jaxgran.particles.spheres import SphereState, temperature
 from jaxgran.scene.elements import wall_impact_ratio
-from jaxgran.scene.gas import ReducedScene, SphereScene
 from jaxgran.scene.laws import ReducedLaw
+from jaxgran.scene.reduced import ReducedScene, SphereScene
 
 
 class LawOfReplicas(ReducedLaw):

@@ -3,7 +3,7 @@
 Units here: the diameter is 1. The time s counts from the start of a window. A path is given by its
 velocity and its position extrapolated back to s = 0, as in x(s) = x + v s.
 
-In a container positions are coordinates from a corner, as in `jaxgran.scene.gas.SphereScene`.
+In a container positions are coordinates from a corner, as in `jaxgran.scene.reduced.SphereScene`.
 """
 
 from typing import NamedTuple

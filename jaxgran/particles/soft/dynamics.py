@@ -52,7 +52,7 @@ from jaxgran.particles.spheres import (
     with_dissipated_energy,
 )
 from jaxgran.particles.start import initial_spins
-from jaxgran.scene.gas import ReducedContact, ReducedScene, SphereScene
+from jaxgran.scene.reduced import ReducedContact, ReducedScene, SphereScene
 from jaxgran.theory.equations import COOLING_CORRECTION
 
 WORK_TOLERANCE = 0.1

@@ -1,6 +1,6 @@
 """Forces on soft spheres, and the time steps of the spheres that may touch within a block.
 
-Units: see `jaxgran.scene.gas.SphereScene`. Spins are (sigma/2) w.
+Units: see `jaxgran.scene.reduced.SphereScene`. Spins are (sigma/2) w.
 
 Without drag a sphere flies freely between contacts. With drag ``dv/dt = -gamma v``, so that
 ``v(t) = v exp(-gamma t)`` and ``x(t) = x + v (1 - exp(-gamma t))/gamma``: a sphere flies along the
@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxgran.particles.elements import flight_time, surface_velocity, torque
 from jaxgran.scene.contact import contact_force, midpoint_rate
-from jaxgran.scene.gas import ReducedContact, ReducedFriction, ReducedScene, SphereScene
+from jaxgran.scene.reduced import ReducedContact, ReducedFriction, ReducedScene, SphereScene
 
 
 class ContactCandidates(NamedTuple):
