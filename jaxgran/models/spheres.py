@@ -21,7 +21,7 @@ from jaxgran.models import checks
 from jaxgran.models.error_model import ErrorModel, slope_bias_of_run
 from jaxgran.models.particle_model import AbstractParticleModel
 from jaxgran.particles.capacity import Capacity, Neighbourhood
-from jaxgran.particles.neighbours import check_engine, choose_engine
+from jaxgran.particles.neighbours.lists import check_engine, choose_engine
 from jaxgran.particles.snapshot import Units
 from jaxgran.particles.spheres import AbstractSphereDynamics
 from jaxgran.particles.start import check_inside, check_start
@@ -97,7 +97,7 @@ class AbstractSpheres(AbstractParticleModel):
             scene: the gas in the units of the run.
             shape: number of replicas, of particles in each, and dimension.
             sizes: static sizes of its arrays.
-            engine: search for pairs, see `jaxgran.particles.neighbours`.
+            engine: search for pairs, see `jaxgran.particles.neighbours.lists`.
         """
 
     @abstractmethod

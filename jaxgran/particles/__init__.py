@@ -6,8 +6,7 @@
 - `spheres`: the state and the motion that soft and hard spheres share.
 - `start`: initial conditions, random or given by the user.
 - `elements`: drag, the kicks of a drive, and rough impacts.
-- `neighbours`: periodic boxes and neighbour lists; the only module that imports jax_md.
-  `cell_list`: lists by cells. `bit_masks`: positions of the set bits of masks.
+- `neighbours`: neighbour lists in periodic boxes. `bit_masks`: positions of the set bits of masks.
   `capacity`: lengths of the arrays of a compiled run.
 - `observables`: public functions of particles. `snapshot`: particles and saved records in SI.
 """

@@ -14,8 +14,9 @@ from jaxtyping import Array, ArrayLike, Int
 
 from jaxgran._utils import status
 from jaxgran.particles.bit_masks import WORD
-from jaxgran.particles.cell_list import expected_run
-from jaxgran.particles.neighbours import compiled_engine, unsorted_share
+from jaxgran.particles.neighbours.cells import expected_run
+from jaxgran.particles.neighbours.lists import compiled_engine
+from jaxgran.particles.neighbours.sweep import unsorted_share
 from jaxgran.scene.geometry import contact_value, sphere_surface
 
 MAX_SHARED_ROWS = 128
@@ -123,7 +124,7 @@ class Neighbourhood(NamedTuple):
             replicas: number of boxes.
             dimension: dimension d.
             listed_more: pairs per particle that the skin adds to the neighbour list.
-            engine: one of `neighbours.ENGINES`.
+            engine: one of `neighbours.lists.ENGINES`.
             longer: factor on the look-ahead of a sweep, of boxes that are shorter along x.
         """
         per_volume = sphere_surface(dimension) / (2 * dimension)

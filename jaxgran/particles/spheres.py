@@ -18,10 +18,10 @@ from equinox import AbstractVar
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from jaxgran._utils import status
-from jaxgran.particles import neighbours, observables
+from jaxgran.particles import observables
 from jaxgran.particles.capacity import Capacity, skin_for_pairs
 from jaxgran.particles.dynamics import AbstractDynamics, advance_time, time_left
-from jaxgran.particles.neighbours import ListedPairs, Pairs
+from jaxgran.particles.neighbours.lists import ListedPairs, Pairs, search_pairs, with_offsets, wrap
 from jaxgran.particles.start import (
     Placement,
     PlacementState,
@@ -133,7 +133,7 @@ class AbstractSphereDynamics(AbstractDynamics):
         capacity: lengths of the arrays.
         equilibration_capacity: the same in the first mean free times of the equilibration.
         listed_by_skin: pairs per particle that the skin adds to the first neighbour list.
-        engine: search for pairs, one of `neighbours.ENGINES` but not "auto".
+        engine: search for pairs, one of `neighbours.lists.ENGINES` but not "auto".
         compiled_engine: the same in compiled code, as in the random placement.
     """
 
@@ -237,7 +237,7 @@ class AbstractSphereDynamics(AbstractDynamics):
         """Return the state at t = 0 with given positions and velocities, and its tangents."""
         position, velocity = start
         dtype = position.dtype
-        inside = neighbours.wrap(self.scene.side, position)
+        inside = wrap(self.scene.side, position)
         drift = jnp.zeros((self.replicas, position.shape[1]), dtype)
         if self.scene.galilean_invariant:
             drift = jnp.mean(by_replica(velocity, self.replicas), axis=1)
@@ -297,9 +297,7 @@ class AbstractSphereDynamics(AbstractDynamics):
         before, listed, end = self.prepare(state, until)
         cutoff = 1 + before.skin
         sizes = self.capacity[:2]
-        found = neighbours.search_pairs(
-            listed, self.scene.side, cutoff, self.replicas, sizes, self.engine
-        )
+        found = search_pairs(listed, self.scene.side, cutoff, self.replicas, sizes, self.engine)
         return self._run_until_stale(state, before, listed, found, end)
 
     @jax.jit
@@ -311,7 +309,7 @@ class AbstractSphereDynamics(AbstractDynamics):
         found: ListedPairs,
         end: ArrayLike,
     ) -> SphereState:
-        pairs = neighbours.with_offsets(listed, self.scene.side, found)
+        pairs = with_offsets(listed, self.scene.side, found)
         needed = jnp.zeros_like(given.needed).at[:2].set(jnp.stack([pairs.count, pairs.lookahead]))
         before = before._replace(status=self.capacity.exceeded_by(needed), needed=needed)
         state = self.recover(self.run_blocks(before, listed, pairs, end), before)
@@ -327,7 +325,7 @@ class AbstractSphereDynamics(AbstractDynamics):
 
     def to_lab_frame(self, state: SphereState) -> tuple[Array, Array, Array | None]:
         drift = self.of_spheres(state.drift)
-        position = neighbours.wrap(self.scene.side, state.position + drift * state.time)
+        position = wrap(self.scene.side, state.position + drift * state.time)
         velocity, spin = self.true_velocities(state)
         return position, velocity + drift, spin
 

@@ -16,9 +16,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced
 from jaxgran.data.curve import Particles
-from jaxgran.particles import neighbours
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import AbstractProcess
+from jaxgran.particles.neighbours.lists import search_pairs, with_offsets, wrap
 from jaxgran.particles.snapshot import box_side
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS, Walls
 from jaxgran.scene.gas import Gas
@@ -128,7 +128,7 @@ class Placement(AbstractProcess):
         skin: of the neighbour list.
         shape: number of boxes, of spheres in each, and dimension.
         capacity: of the neighbour list.
-        engine: see `neighbours.search_pairs`; one that works in compiled code.
+        engine: see `neighbours.lists.search_pairs`; one that works in compiled code.
     """
 
     side: Float[Array, ""]
@@ -166,12 +166,10 @@ class Placement(AbstractProcess):
         """Build a neighbour list, and push until it is stale or no overlap is left."""
         side = self.side
         replicas, num_particles, dimension = self.shape
-        built = neighbours.wrap(side, state.position)
+        built = wrap(side, state.position)
         cutoff = 1 + self.skin
-        listed = neighbours.search_pairs(
-            built, side, cutoff, replicas, self.capacity[:2], self.engine
-        )
-        pairs = neighbours.with_offsets(built, side, listed)
+        listed = search_pairs(built, side, cutoff, replicas, self.capacity[:2], self.engine)
+        pairs = with_offsets(built, side, listed)
         needed = jnp.zeros_like(state.needed).at[:2].set(jnp.stack([pairs.count, pairs.lookahead]))
         full = self.capacity.exceeded_by(needed)
         volume = side**dimension if self.region is None else jnp.prod(self.region + 1)
@@ -211,9 +209,7 @@ class Placement(AbstractProcess):
         state, _ = jax.lax.while_loop(is_fresh, push_all, first)
         failed = state.overlap & (state.num_pushes >= MAX_PUSHES)
         fault = full | status.flag(status.OVERLAPS_REMAIN, failed)
-        return state._replace(
-            position=neighbours.wrap(side, state.position), needed=needed, status=fault
-        )
+        return state._replace(position=wrap(side, state.position), needed=needed, status=fault)
 
 
 def check_start(start: Particles | None, gas: Gas, replicas: int, num_particles: int) -> None:

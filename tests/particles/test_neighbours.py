@@ -7,24 +7,24 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from jaxgran.particles import neighbours
-from jaxgran.particles.cell_list import expected_run
-from jaxgran.particles.neighbours import (
+from jaxgran.particles.neighbours.cells import cells, expected_run
+from jaxgran.particles.neighbours.lists import (
     MAX_LOOKAHEAD,
-    cells,
     check_engine,
     choose_engine,
     compiled_engine,
-    sweep,
+    search_pairs,
+    with_offsets,
     wrap,
 )
+from jaxgran.particles.neighbours.sweep import sweep
 
 
 def find_pairs(position, side, cutoff, *, replicas=1, capacity, by="cells"):
     """All pairs with their offsets; a sweep may look ahead over all particles of a replica."""
     capacities = capacity, len(position) // replicas
-    pairs = neighbours.search_pairs(position, side, cutoff, replicas, capacities, by)
-    return neighbours.with_offsets(position, side, pairs)
+    pairs = search_pairs(position, side, cutoff, replicas, capacities, by)
+    return with_offsets(position, side, pairs)
 
 
 def brute_force(position, side, cutoff, replicas):

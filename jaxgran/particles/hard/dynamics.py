@@ -16,7 +16,6 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, UInt32
 from jaxgran._utils import status
 from jaxgran.gradients.rule import Records
 from jaxgran.gradients.tangents import ExchangeTangents
-from jaxgran.particles import neighbours
 from jaxgran.particles.bit_masks import rows_where
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import time_left
@@ -30,7 +29,8 @@ from jaxgran.particles.elements import (
 )
 from jaxgran.particles.hard.impacts import MAX_ROUNDS, ImpactWork, execute_impacts
 from jaxgran.particles.hard.prediction import ImpactCandidates, PairRows, Paths, first_impacts
-from jaxgran.particles.neighbours import Pairs, select_members
+from jaxgran.particles.neighbours.lists import Pairs, wrap
+from jaxgran.particles.neighbours.selection import select_members
 from jaxgran.particles.spheres import (
     FATAL,
     AbstractSphereDynamics,
@@ -182,7 +182,7 @@ class HardDynamics(AbstractSphereDynamics):
         if container is not None:
             inside = jnp.clip(state.position + flown, 0.5, container[None] - 0.5)
             flown = inside - state.position
-        listed = neighbours.wrap(side, state.position + flown)
+        listed = wrap(side, state.position + flown)
         image = jnp.round((state.position + flown - listed) / side).astype(jnp.int32)
         prepared = state._replace(position=listed - flown, image=state.image + image)
         return prepared, listed, jnp.where(life < time_until_end, state.time + life, end)
@@ -285,12 +285,12 @@ class HardDynamics(AbstractSphereDynamics):
         closer = free.motion.gap(disturbed) < 2 * rows.bound * (duration - disturbed)
         selected = rows.real & (jnp.isfinite(free.times) | closer)
         at_walls = jnp.zeros(n, bool) if free.wall_times is None else jnp.isfinite(free.wall_times)
-        picked, real, members, (a, b), counts = select_members(
-            selected, i, j, at_walls, self.capacity[3:]
+        found = select_members(selected, i, j, at_walls, self.capacity[3:])
+        rows = PairRows(
+            found.first, found.second, offset[found.rows], rows.bound[found.rows], found.real
         )
-        rows = PairRows(a, b, offset[picked], rows.bound[picked], real)
-        needed = jnp.stack([pairs.count, pairs.lookahead, num_near, *counts])
-        return ImpactCandidates(members, rows, members // size, needed)
+        needed = jnp.stack([pairs.count, pairs.lookahead, num_near, *found.counts])
+        return ImpactCandidates(found.members, rows, found.members // size, needed)
 
     def _state_after_window(
         self, state: SphereState, candidates: ImpactCandidates, work: ImpactWork, duration: Array

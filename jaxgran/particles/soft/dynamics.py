@@ -18,10 +18,11 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, Shaped
 from jaxgran._utils import status
 from jaxgran.gradients.rule import Records
 from jaxgran.gradients.tangents import ContactTangents, RateSums, component_along
-from jaxgran.particles import neighbours, observables
+from jaxgran.particles import observables
 from jaxgran.particles.bit_masks import rows_where
 from jaxgran.particles.capacity import Capacity, max_skin
-from jaxgran.particles.neighbours import Pairs, marked, select_members
+from jaxgran.particles.neighbours.lists import Pairs, wrap
+from jaxgran.particles.neighbours.selection import marked, select_members
 from jaxgran.particles.soft.forces import (
     PAIR,
     WALL,
@@ -219,7 +220,7 @@ class SoftDynamics(AbstractSphereDynamics):
     @jax.jit
     def prepare(self, state: SphereState, end: ArrayLike) -> tuple[SphereState, Array, ArrayLike]:
         side = self.scene.side
-        inside = neighbours.wrap(side, state.position)
+        inside = wrap(side, state.position)
         image = state.image + jnp.round((state.position - inside) / side).astype(jnp.int32)
         return state._replace(position=inside, image=image), inside, end
 
@@ -352,21 +353,20 @@ class SoftDynamics(AbstractSphereDynamics):
         active = marked(extra | alone, ends, touching[None])
         active = marked(active, ends, (real & (active[i] | active[j]))[None])
         selected = real & (active[i] | active[j])
-        rows, real, members, (a, b), counts = select_members(
-            selected, i, j, alone, self.capacity[3:]
-        )
-        i = i[rows]
-        j = j[rows]
-        offset = offset[rows]
+        found = select_members(selected, i, j, alone, self.capacity[3:])
+        i = i[found.rows]
+        j = j[found.rows]
+        # An empty row is a pair out of reach.
+        offset = jnp.where(found.real[:, None], offset[found.rows], 2.0)
         return ContactCandidates(
-            members=members,
-            a=a,
-            b=b,
-            offset=jnp.where(real[:, None], offset, 2.0),  # an empty row is a pair out of reach
+            members=found.members,
+            a=found.first,
+            b=found.second,
+            offset=offset,
             replica=i // (n // self.replicas),
             expected=active[i] & active[j],
-            expected_at_walls=active.at[members].get(mode="fill", fill_value=True),
-            needed=jnp.stack([pairs.count, pairs.lookahead, num_near, *counts]),
+            expected_at_walls=active.at[found.members].get(mode="fill", fill_value=True),
+            needed=jnp.stack([pairs.count, pairs.lookahead, num_near, *found.counts]),
         )
 
     def _hottest(self, state: SphereState) -> Float[Array, ""]:
