@@ -152,7 +152,7 @@ class AbstractParticleModel(AbstractModel):
             others: key of the random numbers, units of the run, and the times in SI.
             directions: of tangents in the material; None for no tangents.
         """
-        save = snapshot.save_function(run.save)
+        save = snapshot.resolve_save(run.save)
         if any_traced(scene, times, start, others):
             checks.refuse_files(self, run)
             traced = partial(self._run_traced, dimension, save)
@@ -225,7 +225,7 @@ class AbstractParticleModel(AbstractModel):
         }
         others = {}
         if self.has_positions:
-            others["particles"] = snapshot.particles(units, self.replicas, *result.particles)
+            others["particles"] = snapshot.to_particles(units, self.replicas, *result.particles)
         if "flow_share" in values:
             others["derivative_bias"] = self.derivative_bias(gas, times, values["flow_share"])
         curve = CoolingCurve.of_replicas(times, values, status=result.status | fault, **others)

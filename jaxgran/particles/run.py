@@ -100,8 +100,8 @@ class Recorder(eqx.Module):
         failed = jnp.broadcast_to(state.status != status.OK, dynamics.shape[:1])
         if self.save is not None:
             arrays = dynamics.to_lab_frame(state)
-            particles = snapshot.particles(self.units, dynamics.shape[0], *arrays)
-            saved = snapshot.saved(self.save, particles)
+            particles = snapshot.to_particles(self.units, dynamics.shape[0], *arrays)
+            saved = snapshot.apply_save(self.save, particles)
             saved = jax.tree.map(partial(nan_where, failed), saved)
         # Replicas are the last axis of all others.
         one_or_nan = jnp.where(failed, jnp.nan, 1.0)  # a factor: derivatives are nan, too
@@ -548,7 +548,7 @@ def _writer(
     def write(k: int, state: Any) -> None:
         arrays = loop.each(_to_lab_frame, dynamics, state)
         joined = jax.tree.map(lambda x: _joined(np.asarray(x), 0, groups), arrays)
-        particles = snapshot.particles(units, replicas, *joined)
+        particles = snapshot.to_particles(units, replicas, *joined)
         trajectory.write(k, float(seconds[k]), particles, sphere)
 
     return write

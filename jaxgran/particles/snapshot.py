@@ -1,9 +1,9 @@
 """Particles in SI for the user, and records of the user's function of them."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -41,7 +41,7 @@ class Units(NamedTuple):
         return cls(length, velocity, 2 * velocity / gas.diameter, side, gas.mass)
 
 
-def particles(
+def to_particles(
     units: Units, replicas: int, position: Array, velocity: Array, spin: Array | None
 ) -> Particles:
     """Return the particles of all replicas from arrays in units of the run."""
@@ -57,19 +57,21 @@ def particles(
     )
 
 
-def save_function(
+def resolve_save(
     save: Callable[[Particles], Any] | str | None,
 ) -> Callable[[Particles], Any] | None:
     """Return the function of the particles of one replica for the option `save` of a run."""
-    return _without_box if save == "particles" else save  # type: ignore[return-value]
+    if isinstance(save, str):  # "particles", as checked before
+        return _without_box
+    return save
 
 
-def _without_box(particles: Particles) -> Particles:
-    return particles._replace(box_side=None)  # type: ignore[arg-type]
+def _without_box(particles: Any) -> Any:
+    return particles._replace(box_side=None)
 
 
-@partial(jax.jit, static_argnames="save")
-def saved(save: Callable[[Particles], Any], particles: Particles) -> Any:
+@eqx.filter_jit
+def apply_save(save: Callable[[Particles], Any], particles: Particles) -> Any:
     """Return what a user's function of the particles of each replica returns, as arrays.
 
     The particles of one replica have arrays of shape (N, d).
