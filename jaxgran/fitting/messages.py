@@ -3,7 +3,7 @@
 `MESSAGES` holds all sentences; the functions below choose and fill them.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -11,9 +11,11 @@ import numpy as np
 import scipy  # which imports scipy.stats at its first use
 
 from jaxgran.data.drop_test import DropTest
+from jaxgran.data.measurement import Measurement
 from jaxgran.fitting.alternatives import AND, DISTINGUISHABLE_SHARE, Alternative, Explanations
 from jaxgran.fitting.goodness import SIGNIFICANCE
 from jaxgran.fitting.kinds import DECLARABLE
+from jaxgran.fitting.measured_rows import UNKNOWN_NUMBER
 from jaxgran.fitting.result import CONDITIONAL, Fit
 from jaxgran.models.base import Limitation
 from jaxgran.scene.parameters import symbol_of, unit_of
@@ -369,7 +371,7 @@ def _scatter(result: Fit) -> Iterator[str]:
     """Yield N by the scatter of each curve for which it is not known."""
     for label, (ratio, error) in result.scatter.items():
         if result.measurements[label].num_particles is None and error < 1.0:
-            number = 1e3 / ratio
+            number = UNKNOWN_NUMBER / ratio
             prefix = f"{label}: " if label else ""
             error = number * error
             yield prefix + say("scatter", number=two_digits(number), error=two_digits(error))
@@ -432,31 +434,49 @@ def _alternatives(result: Fit, *, quick: bool) -> Iterator[str]:
             yield say(f"{kind}is possible", **words)
 
 
+def _in_curves(result: Fit, words: str, holds: Callable[[Measurement], bool]) -> Iterator[str]:
+    """Yield words that hold for all curves, or for those that they then name; nothing for none.
+
+    Without a curve they are those of the drop tests.
+    """
+    of_curves = {k: m for k, m in result.measurements.items() if not isinstance(m.data, DropTest)}
+    curves = of_curves or result.measurements
+    labels = [label for label, m in curves.items() if holds(m)]
+    if labels:
+        yield words if len(labels) == len(curves) else f"{words} ({', '.join(labels)})"
+
+
 def _absent_effects(result: Fit) -> list[str]:
     """Return the effects that are known to be absent, with the curves if not in all of them."""
-    curves = {k: m for k, m in result.measurements.items() if not isinstance(m.data, DropTest)}
-    effects = dict.fromkeys(effect for m in curves.values() for effect in m.absent)
-    found = []
-    for effect in effects:
-        labels = [label for label, m in curves.items() if effect in m.absent]
-        in_all = len(labels) == len(curves)
-        found.append(effect if in_all else f"{effect} ({', '.join(labels)})")
-    return found
+    effects = dict.fromkeys(x for m in result.measurements.values() for x in m.absent)
+    return [
+        text
+        for effect in effects
+        for text in _in_curves(result, effect, lambda m, effect=effect: effect in m.absent)
+    ]
+
+
+SPHERES = {
+    "diameter_sd": "smooth spheres of one material, whose sizes differ as given",
+    "friction": "equal spheres of constant friction",
+    "surface": "equal, rough spheres of constant beta_t",
+}
+"""What a model assumes of spheres with an element, the first one that they have."""
 
 
 def _assumptions(result: Fit) -> str:
-    elements = {e for m in result.measurements.values() for e in m.gas.elements}
-    assumed = ["equal, smooth spheres"]
-    if "diameter_sd" in elements:
-        assumed = ["smooth spheres of one material, whose sizes differ as given"]
-    if "surface" in elements:
-        assumed = ["equal, rough spheres of constant beta_t"]
-    if "friction" in elements:
-        assumed = ["equal spheres of constant friction"]
-    if "container" not in elements:
-        assumed.append("far from walls")
-    if "drag" not in elements:
-        assumed.append("in vacuum")
+    def spheres(m: Measurement) -> str:
+        own = (words for element, words in SPHERES.items() if element in m.gas.elements)
+        return next(own, "equal, smooth spheres")
+
+    kinds = dict.fromkeys(map(spheres, result.measurements.values()))
+    assumed = [
+        text
+        for kind in kinds
+        for text in _in_curves(result, kind, lambda m, k=kind: spheres(m) == k)
+    ]
+    assumed += _in_curves(result, "far from walls", lambda m: m.gas.container is None)
+    assumed += _in_curves(result, "in vacuum", lambda m: m.gas.drag is None)
     if not getattr(result.model, "has_positions", False):
         assumed.append("at homogeneous density")
     return say("assumptions", all=", ".join(assumed))

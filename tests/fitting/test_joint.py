@@ -207,6 +207,8 @@ def test_an_effect_that_one_curve_tells_stays_possible_in_another():
     both = jaxgran.fit({"free": free, "other": other}, progress=False)
     assert any(x.effect == "walls" for x in both.alternatives)
     assert any("walls (free)" in reason for reason in both.reasons)
+    boxed = {"told": told, "untold": untold}
+    assert any("far from walls (untold)" in x for x in jaxgran.fit(boxed, quick=True).reasons)
 
 
 def test_a_second_effect_of_one_curve_keeps_the_first_one_of_the_others():
