@@ -180,11 +180,6 @@ def _checked(result: Any, runs: int) -> Measurement:
         )
     if [*result.measurements] != [""] or not isinstance(result.curve, CoolingCurve):
         raise ValueError("imitate takes a fit of one curve: imitate the curves one by one")
-    if result.names[0] not in result.gas.domains:
-        raise ValueError(
-            "imitate counts ranges of the first free parameter, which must be one of the gas, got "
-            f"{result.names[0]}: free another one first"
-        )
     measurement = result.measurements[""]
     N = measurement.num_particles
     if N is None:
@@ -195,6 +190,11 @@ def _checked(result: Any, runs: int) -> Measurement:
         raise ValueError(
             f"{runs} imitations of {measurement.replicas} x {N} grains are {grains:.2g} grains; "
             f"{MAX_GRAINS:.2g} are allowed: ask for {fewer} runs or fewer"
+        )
+    if result.names[0] not in result.gas.domains:
+        raise ValueError(
+            "imitate counts ranges of the first free parameter, which must be one of the gas, got "
+            f"{result.names[0]}: free another one first"
         )
     curve = replace(measurement.curve, displacement=None, displacement_error=None)
     priors = dict(measurement.priors)
