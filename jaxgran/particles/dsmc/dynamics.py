@@ -557,7 +557,7 @@ class DSMCDynamics(AbstractDynamics):
             after = [v + kicks, spin, at_zero - gas.time * kicks]
             return jnp.concatenate(after, axis=-1), jnp.sum(kicks * (2 * v + kicks))
 
-        first = count * (2 * start.steps + place).astype(jnp.int32)
+        first = count * (2 * gas.steps + place).astype(jnp.int32)
         zero = jnp.zeros((), growth.dtype)
         particles, gain = change_subsets(gas.particles, first, count, largest.kicked, kick, zero)
         grown = 2 * gain / (self.scheme.num_particles * d)
