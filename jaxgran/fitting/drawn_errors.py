@@ -13,7 +13,7 @@ from jaxgran.fitting.innovations import SAMPLE_MEMORY
 from jaxgran.fitting.measured_rows import sampling_variance
 from jaxgran.fitting.result import Fit
 
-QUANTITIES = ("temperature", "rotational_temperature")
+TEMPERATURES = ("temperature", "rotational_temperature")
 
 
 def imitations(
@@ -37,7 +37,7 @@ def imitations(
     """
     scale = np.exp(measurement.calibration_error * rng.normal(size=(runs, 1)))
     fields = {}
-    for name in QUANTITIES:
+    for name in TEMPERATURES:
         if getattr(measurement.curve, name) is None:
             continue
         each = np.asarray(getattr(curve.replicas, name)).reshape(runs, measurement.replicas, -1)

@@ -37,9 +37,6 @@ UNKNOWN_NUMBER = 1e3
 SCATTER_ERROR = 0.05
 """Relative error of the variance that theory gives to a run of N grains."""
 
-DISPLACEMENT_ERROR = "msd_err"
-"""Column of the errors of <dr^2>."""
-
 ERRORS_OF_PARTICLES = 0.1
 """Relative difference up to which T_err is taken for the fluctuation of independent samples."""
 
@@ -124,12 +121,8 @@ def with_errors_that_count(measurement: Measurement) -> Measurement:
     for column, name in enumerate(("temperature_error", "rotational_temperature_error")):
         known = getattr(measurement.curve, name) is not None and np.any(errors[:, column] > 0)
         fields[name] = jnp.asarray(errors[:, column]) if known else None
-    displacement = measurement.curve.displacement
-    if displacement is not None:
-        given = measurement.curve.displacement_error
-        values = np.asarray(displacement)
-        dimension = measurement.gas.dimension
-        error = _errors_of_measurement(DISPLACEMENT_ERROR, exact, given, values, dimension, [])
+    if measurement.curve.displacement is not None:
+        error = _displacement_errors(measurement, [])
         fields["displacement_error"] = jnp.asarray(error) if np.any(error > 0) else None
     data = replace(measurement.curve, **fields)
     return replace(measurement, data=data, errors_measured=True)
@@ -202,10 +195,9 @@ def _errors_of_measurement(
     if given is None:
         return nothing
     error = np.asarray(given)
-    is_known = measurement.num_particles is not None or measurement.tracked is not None
     if measurement.errors_measured:
         return error
-    if measurement.replicas > 1 and (is_known or name != DISPLACEMENT_ERROR):
+    if measurement.replicas > 1:
         notes.append(
             f"{name} is not used: the scatter of the grains of {measurement.replicas} runs is "
             "known. If these are errors of the measurement, say so: `errors: measured`"
@@ -245,9 +237,7 @@ def _displacement(
         return None, notes
     values = np.asarray(curve.displacement)
     given = curve.displacement_error
-    errors = _errors_of_measurement(
-        DISPLACEMENT_ERROR, measurement, given, values, gas.dimension, notes
-    )
+    errors = _displacement_errors(measurement, notes)
     is_measured = np.ones(values.shape, bool) if given is None else np.asarray(given) > 0
     of_grains = 0.0 if N is None else 2 / (gas.dimension * N * measurement.replicas)
     used = (values > 0) & is_measured
@@ -260,6 +250,19 @@ def _displacement(
     factor = np.linalg.cholesky(covariance)
     whitening[np.ix_(used, used)] = np.linalg.inv(factor)
     return Displacement(logs, whitening, float(accuracy)), notes
+
+
+def _displacement_errors(measurement: Measurement, notes: list[str]) -> Float[np.ndarray, "times"]:
+    """Return the standard errors of <dr^2> that a fit counts, and add notes on the others.
+
+    Without a number of grains all count: the scatter of <dr^2> does not tell it.
+    """
+    values = np.asarray(measurement.curve.displacement)
+    given = measurement.curve.displacement_error
+    if given is not None and (measurement.tracked or measurement.num_particles) is None:
+        return np.asarray(given)
+    dimension = measurement.gas.dimension
+    return _errors_of_measurement("msd_err", measurement, given, values, dimension, notes)
 
 
 def _correlation_of_walks(logs: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n n"]:

@@ -437,7 +437,7 @@ def _alternatives(result: Fit, *, quick: bool) -> Iterator[str]:
 def _in_curves(result: Fit, words: str, holds: Callable[[Measurement], bool]) -> Iterator[str]:
     """Yield words that hold for all curves, or for those that they then name; nothing for none.
 
-    Without a curve they are those of the drop tests.
+    In a fit of drop tests alone these take the place of curves.
     """
     of_curves = {k: m for k, m in result.measurements.items() if not isinstance(m.data, DropTest)}
     curves = of_curves or result.measurements

@@ -10,6 +10,7 @@ import pytest
 
 import jaxgran
 from jaxgran.fitting import estimate
+from jaxgran.fitting.alternatives import Alternative, Explanations
 from jaxgran.fitting.messages import describe_search
 from jaxgran.models.linearise import with_neutral_elements
 from jaxgran.scene.laws import ViscoelasticVariant
@@ -214,6 +215,37 @@ def test_the_range_holds_A_where_two_elements_are_not_told(elements, first, seco
     assert f"with {first}, in which A = {alone.estimate[0]:.3g} s." in result.verdict
 
 
+def explanation(improvement, low, high, preferred=False):
+    ends = np.array([low]), np.array([high])
+    return Alternative(
+        name="",
+        effect="",
+        amplitude=1.0,
+        allowed=(0.0, 1.0),
+        improvement=improvement,
+        estimate=np.array([1.0]),
+        low=ends[0],
+        high=ends[1],
+        preferred=preferred,
+        distinguishable=False,
+        error_reduction_needed=1.0,
+    )
+
+
+@pytest.mark.parametrize(
+    ("improvement", "preferred", "low", "high"),
+    [
+        pytest.param(8.0, False, 0.5, 1.1, id="better by chance"),
+        pytest.param(12.0, True, 0.8, 0.9, id="significantly better"),
+    ],
+)
+def test_a_range_leaves_out_what_fits_significantly_worse(improvement, preferred, low, high):
+    law = explanation(0.0, 0.95, 1.05)
+    others = explanation(0.0, 0.5, 1.1), explanation(improvement, 0.8, 0.9, preferred)
+    found = Explanations(law, others, significant=10.0).ranges()
+    assert (found[0][0], found[1][0]) == (low, high)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("error", [0.005, 0.02])
 def test_the_range_holds_A_where_walls_and_errors_of_T_are_not_told(error):
@@ -242,6 +274,7 @@ def test_errors_of_T_that_are_not_told_do_not_move_the_estimate(num_particles):
     assert in_range(result, gas.value(A))
     assert any(re.search(r"T scatters by (4|5)[.\d]* % more", x) for x in result.reasons)
     told = fitted(gas, curve, free=BOTH, num_particles=num_particles)
+    # The size of the errors is found from 40 values, to 11 %.
     assert float(told.standard_error[0]) == pytest.approx(float(result.standard_error[0]), rel=0.2)
 
 
@@ -349,6 +382,17 @@ def test_no_alternatives_of_a_curve_in_other_units():
         fit = fitted(gas, scaled, quick=False)
         assert fit.grade == "not consistent" and not fit.alternatives
         assert "check the units, the scale of T and T0" in str(fit.reasons)
+
+
+def test_a_curve_that_rotation_heats_may_rise():
+    """Grains that spin faster than they fly give energy to T, and the fit is a good one."""
+    surface = jaxgran.Rough(0.5, rotational_temperature=0.1)
+    gas = dataclasses.replace(glass_beads(0.1), surface=surface)
+    times = np.linspace(0.1, 1.0, 10) * float(gas.mean_free_time)
+    T = jaxgran.cool(gas, times).temperature
+    assert T[-1] > 1.2 * T[0]
+    result = fitted(gas, jaxgran.CoolingCurve(times, T), num_particles=1000)
+    assert not any("rises" in reason for reason in result.reasons)
 
 
 @pytest.mark.filterwarnings("ignore:this curve does not determine")

@@ -66,8 +66,10 @@ def imitated(measurement, errors_of_T=0.0, runs=2 * RUNS):
 )
 def test_imitations_have_the_errors_that_the_fit_counts(options, error):
     each, ratio = imitated(planned(**options), runs=2 * RUNS // options.get("replicas", 1))
-    assert np.std(ratio) == pytest.approx(error, rel=0.1, abs=1e-3)
-    assert np.mean(ratio) == pytest.approx(1.0, abs=0.02)
+    # Of 300 runs, whose errors may be common to all 10 times: 4 % of the width by chance, and .3 %
+    # of the mean; without errors both are exact.
+    assert np.std(ratio) == pytest.approx(error, rel=0.13, abs=1e-9)
+    assert np.mean(ratio) == pytest.approx(1.0, abs=0.01)
     if "errors_measured" in options:  # not more where the noise is low
         exact = jaxgran.cool(GAS, TIMES).temperature
         assert np.allclose(each[0].curve.temperature_error, 0.02 * exact)
@@ -80,8 +82,9 @@ def test_errors_that_the_fit_found_are_drawn_and_priors_are_about_the_truth():
     priors = {"density": (2600.0, 125.0)}
     bare = planned(data=jaxgran.CoolingCurve(TIMES, T), priors=priors)
     each, ratio = imitated(bare, errors_of_T=0.03)
-    assert np.std(ratio) == pytest.approx(0.03, rel=0.1)
+    assert np.std(ratio) == pytest.approx(0.03, rel=0.04)  # .9 % by chance, of 6000 values
     densities = np.array([m.priors["density"][0] for m in each])
+    # Of 600 priors: .2 % of the mean by chance, 3 % of the width, which is 4.8 % of the density.
     assert np.mean(densities) == pytest.approx(2500.0, rel=0.01)
     assert np.std(densities) == pytest.approx(120.0, rel=0.1)
 

@@ -189,6 +189,7 @@ def test_curves_of_the_same_grains_share_the_error_of_their_density(second_diame
     alone = jaxgran.fit(data["first"], quick=True)
     both = jaxgran.fit(data, quick=True)
     found = float(both.standard_error[0] / alone.standard_error[0])
+    # Errors of the measurement and of theory, which do average, are a tenth of the density's part.
     assert found == pytest.approx(ratio, abs=0.05)
 
 
