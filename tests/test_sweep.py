@@ -61,6 +61,7 @@ def files(path):
     return {p: p.read_bytes() for p in path.rglob("*") if p.is_file()}
 
 
+@pytest.mark.slow
 def test_members_are_the_curves_of_cool():
     curves = sweep(chunk=2)
     for i, a in enumerate(A):
@@ -102,6 +103,7 @@ def test_saved_values_are_those_of_cool_for_each_member(store_of_saved):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), one, other)
 
 
+@pytest.mark.slow
 def test_a_store_has_labels_and_units_for_xarray(store, store_of_saved):
     xarray = pytest.importorskip("xarray")
     found = xarray.open_zarr(store[0])

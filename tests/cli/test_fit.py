@@ -47,6 +47,7 @@ def test_several_measurements_are_fitted_jointly(measured, fit):
     assert (measured / "fitted" / "thin-kinetic-theory.png").read_bytes()[:8] == PNG
 
 
+@pytest.mark.slow
 def test_a_contradicting_drop_test_is_reported(fit):
     # As many measurements as above, so that the program is compiled already.
     out, answer = fit("thin.csv", "dense.csv", "--drop-test", "others.csv")
@@ -97,6 +98,7 @@ def test_a_drop_test_stands_alone(fit):
     assert "drops    20 impacts" in out and answer["verdict"] == "determined"
 
 
+@pytest.mark.slow
 def test_a_late_clock_is_told_and_leaves_A_determined(measured, run):
     rewrite("thin.csv", shifted(1e4), "late.csv")
     status, out, err = run("fit", "late.csv", "--free", "A", "t0", "--quick")

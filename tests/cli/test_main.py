@@ -24,6 +24,7 @@ def test_cool_writes_the_curve_of_the_package(scene, run):
     assert status == 2 and "exists. Name another --out" in err
 
 
+@pytest.mark.slow
 def test_the_curve_of_a_run_of_particles_tells_their_number(scene):
     options = ["--model", "dsmc", "--particles", "6.4e1", "--replicas", "2", "--until", "0.1"]
     assert main(["cool", "scene.toml", *options]) == 0
@@ -31,6 +32,7 @@ def test_the_curve_of_a_run_of_particles_tells_their_number(scene):
     assert header["N"] == "64" and header["replicas"] == "2"
 
 
+@pytest.mark.slow
 def test_a_computed_curve_begins_with_the_gas_and_keeps_no_key_of_a_measurement(scene):
     head = SCENE.replace(" = ", ": ").replace("\n", "\n# ")
     keys = "t0: 5\n# t0_err: 1\n# tracked: 100\n# T_scale_err: 0.01"
@@ -41,6 +43,7 @@ def test_a_computed_curve_begins_with_the_gas_and_keeps_no_key_of_a_measurement(
     assert {"t0", "tracked", "T_scale_err"}.isdisjoint(header)
 
 
+@pytest.mark.slow
 def test_the_number_of_a_container_is_that_of_its_density(scene):
     box = "container_side = 0.02\nwall_restitution = 0.9\n"
     (scene / "box.toml").write_text(SCENE + box)

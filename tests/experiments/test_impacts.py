@@ -31,6 +31,7 @@ def impacts_of(film, error, tmp_path, **header):
     return jaxgran.read_impacts(tmp_path / "tracks.csv")
 
 
+@pytest.mark.slow
 def test_impacts_have_the_speeds_and_the_law_of_the_spheres(filmed, tmp_path):
     found = impacts_of(filmed, 4e-5, tmp_path, localisation_error=4e-5)
     truth = study.judged(filmed, found)

@@ -92,6 +92,7 @@ def test_a_crystal_is_beyond_models_without_positions():
         assert any("0.64 is above 0.545, where spheres form a crystal" in x for x in decisive)
 
 
+@pytest.mark.slow
 def test_gravity_is_said_to_be_taken_as_absent_between_walls():
     between = dataclasses.replace(glass_beads(0.1), container=jaxgran.Walls(0.1, restitution=0.8))
     for gas in (glass_beads(0.1), between):
@@ -167,6 +168,7 @@ def without_chance(gas, curve, **options):
     return fitted(gas, curve, quick=False, num_particles=10**7, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("absent, element, name", ELEMENTS)
 def test_the_range_holds_A_where_an_element_is_not_told(absent, element, name):
     gas = glass_beads(0.1)
@@ -189,6 +191,7 @@ def test_the_range_holds_A_where_an_element_is_not_told(absent, element, name):
     assert f"known to be absent: {absent}" in told.reasons
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "elements, first, second",
     [
@@ -261,6 +264,7 @@ def test_the_range_holds_A_where_walls_and_errors_of_T_are_not_told(error, seeds
         assert in_range(result, gas.value(A))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_particles", [10**4, slow(10**8)])
 def test_errors_of_T_that_are_not_told_do_not_move_the_estimate(num_particles):
     """Without T_err, and far above the scatter of N grains, they are found, and said."""
@@ -333,6 +337,7 @@ def test_a_constant_restitution_is_named_and_A_has_no_meaning_then():
     assert "no meaning" not in viscoelastic.headline
 
 
+@pytest.mark.slow
 def test_eps_that_scatters_is_an_alternative():
     gas = glass_beads(0.1)
     variant = dataclasses.replace(ViscoelasticVariant.from_law(gas.law), spread=0.15)
@@ -355,6 +360,7 @@ def test_no_alternative_is_preferred_where_all_is_told():
         assert drag.distinguishable and drag.allowed[1] < 0.02
 
 
+@pytest.mark.slow
 def test_declared_absences_narrow_the_range():
     gas = glass_beads(0.1)
     curve = exact_to(gas, 0)
@@ -384,6 +390,7 @@ def test_no_alternatives_of_a_curve_in_other_units():
         assert "check the units, the scale of T and T0" in str(fit.reasons)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:this curve does not determine")
 def test_a_curve_that_rotation_heats_may_rise():
     """Grains that spin faster than they fly give energy to T, and the fit is a good one."""

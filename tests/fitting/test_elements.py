@@ -27,6 +27,7 @@ def are_found(result, gas, names):
 OF_PARTICLES = pytest.param(jaxgran.DSMC(10_000), marks=pytest.mark.slow)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", [THEORY, OF_PARTICLES])
 def test_roughness_and_A_are_found_together(model):
     gas = rough_beads()

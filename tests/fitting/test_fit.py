@@ -61,6 +61,7 @@ def test_intervals_cover_the_truth(record):
     record("intervals", coverage=coverage.tolist())
 
 
+@pytest.mark.slow
 def test_without_errors_and_N_the_scatter_tells_both():
     # Independent errors are not the scatter of a run: they are preferred as an explanation.
     gas, curve = cooled_beads(5)

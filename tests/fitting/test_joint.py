@@ -155,6 +155,7 @@ def test_two_copies_are_one_measurement(write):
             jaxgran.fit(copies)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [("box", "drops"), ("drops", "box")])
 def test_a_drop_test_may_come_first(order):
     """The parameters of a fit are those of its curves, whatever comes first."""
@@ -193,6 +194,7 @@ def test_curves_of_the_same_grains_share_the_error_of_their_density(second_diame
     assert found == pytest.approx(ratio, abs=0.05)
 
 
+@pytest.mark.slow
 def test_an_effect_that_one_curve_tells_stays_possible_in_another():
     """Walls that one file describes, or excludes, do not exclude walls of another container."""
     gas = glass_beads(0.1)

@@ -48,6 +48,7 @@ def test_the_filter_is_the_dense_covariance(name):
     assert found == pytest.approx(expected, abs=1.0 if gas.surface is not None else 0.02)
 
 
+@pytest.mark.slow
 def test_the_likelihood_is_that_of_the_fit():
     gas, curve = cooled_beads()
     measurement = jaxgran.Measurement(gas, curve, num_particles=10**6)
@@ -88,6 +89,7 @@ def test_likelihoods_that_cannot_be():
         jaxgran.log_likelihood(gas, curve)
 
 
+@pytest.mark.slow
 def test_the_error_of_a_sample_of_grains_is_remembered():
     # A Gaussian process of the covariance S exp(-k |tau_i - tau_j|), and nothing else.
     size = 12

@@ -82,6 +82,7 @@ def test_imitations_begin_with_the_gas():
     assert np.all(np.abs(np.log(ratio)) < 0.3)
 
 
+@pytest.mark.slow
 def test_displacements_of_the_same_grains_do_not_average():
     """More times tell little more: <dr^2> of N grains is one random number, and not a new one."""
     errors = []

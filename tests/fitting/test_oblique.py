@@ -83,6 +83,7 @@ def test_errors_of_speeds_and_angles_are_in_the_error_bars(measured):
     assert np.all(np.abs(np.mean(off, axis=0)) < 0.7), np.mean(off, axis=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("onto, of_centres", [("sphere", False), ("plate", True)])
 def test_oblique_impacts_give_all_three_constants(onto, of_centres):
     test = impacts(ROUGH, 1, onto=onto, of_centres=of_centres)
@@ -93,6 +94,7 @@ def test_oblique_impacts_give_all_three_constants(onto, of_centres):
     assert "degrees from the normal" in report(result)
 
 
+@pytest.mark.slow
 def test_the_rule_of_impact_is_that_of_hard_spheres():
     """Two spheres collide in a simulation: eps and eps_t are those that a drop test computes."""
     gas = ROUGH

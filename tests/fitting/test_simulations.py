@@ -121,6 +121,7 @@ def fitted(model, truth=TRUTH, first=(0.0, 0.0), gas=GAS, **settings):
     return fit_measured(gas, curve, model=model, progress=False, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bias", [0.8, 1.0, 1.2])
 def test_a_biased_slope_does_not_move_the_answer(bias):
     quiet = fitted(StandIn(bias=bias, noise=1e-6), first=(-0.6, 0.3))
@@ -203,6 +204,7 @@ def test_curves_without_replicas_are_refused():
         fitted(OneRun())
 
 
+@pytest.mark.slow
 def test_more_runs_make_it_quieter():
     model = StandIn(noise=0.06, replicas=16)
     found, once = (fitted(model, first=(0.25, -0.2), max_steps=steps) for steps in (8, 1))

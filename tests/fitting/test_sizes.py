@@ -27,6 +27,7 @@ def curve(gas):
     return jaxgran.cool(gas, times, model=jaxgran.KineticTheory())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("of_energy", [False, True])
 def test_a_curve_without_noise_gives_its_own_constant(gas, curve, of_energy):
     T = np.asarray(curve.temperature)

@@ -43,6 +43,7 @@ def test_a_gas_begun_before_the_file_is_found():
     assert abs(float(t0) + first) < 3 * float(deviation)
 
 
+@pytest.mark.slow
 def test_t0_and_the_first_temperature_are_not_found_together():
     gas, curve = cooled_beads()
     with pytest.warns(UserWarning, match="T0 and t0: .*forgets"):

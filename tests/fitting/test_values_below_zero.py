@@ -91,6 +91,7 @@ def test_ln_T_is_compared_far_from_zero_bit_for_bit():
     )
 
 
+@pytest.mark.slow
 def test_displacements_below_zero_are_left_out_and_counted():
     times = np.geomspace(0.1, 100, 30) * float(GAS.mean_free_time)
     exact = jaxgran.cool(GAS, times)

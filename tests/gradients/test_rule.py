@@ -41,6 +41,7 @@ NAN_CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model, name, value", NAN_CASES)
 def test_derivatives_are_nan_where_values_are(model, name, value):
     def temperature(x):

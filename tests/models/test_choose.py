@@ -59,6 +59,7 @@ MEASURED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", MEASURED)
 def test_estimates_bound_what_was_measured(scene):
     phi, contact, dimension, n, beta, duration, deviation, error = MEASURED[scene]
@@ -111,6 +112,7 @@ def test_only_a_flow_makes_noise_besides():
         assert (noise > 1.5 * shots) is more
 
 
+@pytest.mark.slow
 def test_each_model_has_its_scene():
     choice = choose(glass_beads(0.15), 10)
     assert isinstance(choice.model, jaxgran.KineticTheory) and choice.error < 0.02
@@ -143,6 +145,7 @@ def test_nothing_accurate_enough_is_said():
         jaxgran.cool(gas, [1e-3], model="auto", tolerance=1e-9)
 
 
+@pytest.mark.slow
 def test_scenes_that_particles_cannot_run_are_left_to_the_others():
     choice = choose(soft_beads(1e-4, packing_fraction=0.6), 10, num_particles=100)
     able = [c.model.name for c in choice.candidates if c.refusal is None]

@@ -58,6 +58,7 @@ def test_single_precision_has_no_trend(kind):
         assert abs(b.mean() - a.mean()) < 3 * error < 0.06
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "model",
     [

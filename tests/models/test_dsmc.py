@@ -272,6 +272,7 @@ def test_derivatives_leave_out_the_shape_of_the_velocity_distribution(beta, exce
     assert abs(run.mean() / theory[0] - 1 - excess) < 0.003 + 3 * error / abs(theory[0])
 
 
+@pytest.mark.slow
 def test_a_derivative_in_the_density_is_one_in_the_times():
     gas = glass_beads()
     times = jnp.array([1.0, 3.0]) * gas.mean_free_time

@@ -44,6 +44,7 @@ def test_reference_table(row, record):
     record("kinetic_theory", row=row, temperature=float(errors[0]), displacement=float(errors[1]))
 
 
+@pytest.mark.slow
 @pytest.mark.figures
 def test_sensitivity_table(record):
     gas = glass_beads(0.15)

@@ -32,6 +32,7 @@ def last_of_lammps(gas, data, position, velocity):
     return last
 
 
+@pytest.mark.slow
 def test_follows_the_lammps_trajectory_particle_by_particle():
     data = dict(np.load(DATA / "lammps_trajectory_n64.npz"))
     side, diameter = float(data["box_side"]), float(data["diameter"])

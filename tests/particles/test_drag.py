@@ -28,6 +28,7 @@ def test_durations_invert_each_other_with_their_derivatives(z):
     np.testing.assert_allclose(slope, 0.0, atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", [jaxgran.DSMC(500), jaxgran.HardSpheres(64)])
 def test_a_gas_without_drag_has_a_derivative_in_its_rate(model):
     """At constant eps drag changes no collision: T is exp(-2 gamma t) T(s), s = t - gamma t^2/2."""

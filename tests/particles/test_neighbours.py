@@ -86,6 +86,7 @@ def test_pairs_are_those_of_brute_force(dimension, by, fraction):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dimension, by", [(2, "cells"), (3, "cells"), (3, "sweep")])
 def test_jit_and_vmap(dimension, by):
     rng = np.random.default_rng(3)
@@ -196,6 +197,7 @@ def test_cells_lose_no_pair_and_say_how_many_they_need(dimension):
                 assert longest < mean + 6 * mean**0.5  # fluctuations of 600 particles
 
 
+@pytest.mark.slow
 def test_cells_count_pairs_beyond_their_capacity():
     position = jnp.asarray(10 * np.random.default_rng(1).random((300, 3)))
     *_, count, _ = cells(position, 10.0, 2.0, replicas=1, capacity=4000, ahead=300)

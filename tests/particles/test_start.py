@@ -46,6 +46,7 @@ def placed(side, shape=(REPLICAS, N, 3), region=None, pairs=1000, engine="sweep"
     return state, pushed(placement, state)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dimension, packing", [(3, 0.02), (3, 0.47), (2, 0.64)])
 def test_no_spheres_overlap_and_boxes_differ(dimension, packing):
     side, shape = side_of(packing, dimension), (REPLICAS, N, dimension)

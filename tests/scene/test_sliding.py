@@ -56,6 +56,7 @@ def test_slip_moments_are_averages_over_slips_and_normal_speeds(dimension, m):
     np.testing.assert_allclose(slip_moments(jnp.asarray(m), dimension), expected, rtol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "element, expected",
     [

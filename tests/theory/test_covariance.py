@@ -87,6 +87,7 @@ def test_spread_of_losses_of_a_power_law(power):
     assert float(square / mean**2) == pytest.approx(expected, rel=3e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["smooth", "disks", "constant", "series"])
 def test_smooth_spheres_have_one_quadrature(name):
     gas = GASES[name]
@@ -138,6 +139,7 @@ def test_mean_rates_are_those_of_the_equations(name):
         assert turned == pytest.approx(float(elements.spins.rotation), rel=2e-3, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_a_driven_gas_forgets_and_reaches_the_variance_of_its_steady_state():
     gas = GASES["driven"]
     state = jaxgran.steady_state(gas)
@@ -165,6 +167,7 @@ def test_a_driven_gas_forgets_and_reaches_the_variance_of_its_steady_state():
     assert decay == pytest.approx(1.0, rel=0.1)  # T is 10 % from steady at first
 
 
+@pytest.mark.slow
 def test_walls_take_regularly():
     # Elastic spheres between walls that take little: the variance of what they take in a time t
     # over the Poissonian one, as the constants say (and with the tail of the oscillator, 1/t).
@@ -222,6 +225,7 @@ def test_does_not_depend_on_units():
     np.testing.assert_allclose(*found, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_variance_goes_as_one_over_n():
     gas = GASES["all"]
     one, many = (THEORY.covariance(gas, taus(gas, 1, 10), n) for n in (1, 250))
@@ -240,6 +244,7 @@ def test_few_times_give_what_many_give():
     np.testing.assert_allclose(found, dense, rtol=3e-3)
 
 
+@pytest.mark.slow
 def test_elements_without_effect_change_nothing():
     gas, model = GASES["smooth"], THEORY.simplified_for(GASES["smooth"])
     times = taus(gas, 1, 10, 100)
@@ -280,6 +285,7 @@ def test_derivatives_agree(name):
         np.testing.assert_allclose(change, forward[..., k], atol=1e-4 * scale)
 
 
+@pytest.mark.slow
 def test_a_batch_is_computed_in_one_program():
     gas = GASES["smooth"]
     A = gas.dissipative_constant * jnp.array([0.9, 1.0, 1.1])

@@ -29,6 +29,7 @@ def taus(gas, *values):
     return np.array(values) * float(gas.mean_free_time)
 
 
+@pytest.mark.slow
 def test_corrections_of_impacts_leave_the_drag_as_it_is():
     gas = of_sizes(glass_beads(0.3, packing_fraction=0.2), 0.15)
     dragged = replace(gas, drag=jaxgran.StokesDrag(0.1 / gas.mean_free_time))
@@ -100,6 +101,7 @@ def test_rates_without_a_spread_are_those_of_equal_spheres(make):
 # --- curves -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_no_spread_is_equal_spheres():
     gas = glass_beads()
     times = taus(gas, 0.3, 3, 30, 300)
@@ -112,6 +114,7 @@ def test_no_spread_is_equal_spheres():
     np.testing.assert_allclose(other, equal, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_elastic_spheres_reach_equipartition_at_constant_energy():
     spread = 0.15
     gas = of_sizes(hard_gas(1.0, 0.01), spread)

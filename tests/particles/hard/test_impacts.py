@@ -15,6 +15,7 @@ from jaxgran.particles.hard.impacts import ImpactEvents, exchange_gains, impact_
 from tests.beads import glass_beads, hard_gas, lattice
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "law",
     [
