@@ -75,9 +75,8 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
     distant = distant_curves(ends.problem, found)
     explanations = None
     if ends.best.converged and not (request.quick or distant):
-        is_driven = any(m.scene.drive is not None for m in problem.curves)
         noise = np.zeros(problem.num_free)
-        explanations = compare_alternatives(ends.problem, ends.minima, noise, is_driven)
+        explanations = compare_alternatives(ends.problem, ends.minima, noise)
     result = assembled(request, ends.problem, ends.best, ends.minima, explanations)
     result = replace(result, **ends.goodness)
     if distant:
