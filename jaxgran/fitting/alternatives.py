@@ -158,15 +158,7 @@ def compare_alternatives(
     is_driven = any(m.scene.drive is not None for m in problem.curves)
     kinds = [] if is_driven else kinds_of(problem, bases[0].flat)
     significant = _significant_fall(problem, bases[0], len(kinds))
-    profiles = {
-        kind: [profile_of(problem, kind, base, base.flat) for base in bases] for kind in kinds
-    }
-    stages = [_Stage(problem, bases[0], bases[0].flat, (), profiles)]
-    while (further := stages[-1].next_effect(significant)) is not None:
-        stage = _beside(stages[-1], further)
-        if stage is None:
-            break
-        stages.append(stage)
+    stages = _stages(problem, bases, kinds, significant)
     trials = [trial for stage in stages for trial in stage.trials()]
     best = min([*bases, *trials], key=lambda trial: trial.value)
     summary = _Summary(problem, bases[0], best, significant, noise)
@@ -185,9 +177,9 @@ def _minima(problem: Problem, minima: list[Minimum]) -> list[Trial]:
     """Return the minima that the data allow as trials, the deepest one first."""
     trials = [trial_of(problem, 0.0, minimum.flat, minimum.flat) for minimum in minima]
     found = sorted((t for t in trials if t is not None), key=lambda trial: trial.value)
+    size = problem.num_free
     different: list[Trial] = []
     for trial in found:
-        size = problem.num_free
         known = any(np.allclose(trial.flat[:size], x.flat[:size], atol=1e-2) for x in different)
         if not known and trial.value <= found[0].value + ALLOWED:
             different.append(trial)
@@ -200,6 +192,22 @@ def _significant_fall(problem: Problem, base: Trial, num_kinds: int) -> float:
     if goodness(problem, found)["smooth_p_value"] < SIGNIFICANCE:
         return np.inf  # such a curve prefers whatever has less noise
     return float(scipy.stats.chi2.isf(PREFERENCE_LEVEL / max(num_kinds, 1), 1))
+
+
+def _stages(
+    problem: Problem, bases: list[Trial], kinds: list[Kind], significant: float
+) -> list["_Stage"]:
+    """Return the alternatives to a law, then those beside each effect that they show."""
+    profiles = {
+        kind: [profile_of(problem, kind, base, base.flat) for base in bases] for kind in kinds
+    }
+    stages = [_Stage(problem, bases[0], bases[0].flat, (), profiles)]
+    while (effect := stages[-1].next_effect(significant)) is not None:
+        stage = _beside(stages[-1], effect)
+        if stage is None:
+            break
+        stages.append(stage)
+    return stages
 
 
 class _Stage(NamedTuple):
@@ -255,28 +263,28 @@ class _Stage(NamedTuple):
         return self.base.value - self.best_of(kind).value
 
 
-def _beside(stage: _Stage, first: Kind) -> _Stage | None:
+def _beside(stage: _Stage, effect: Kind) -> _Stage | None:
     """Return the alternatives beside one more effect; None if it cannot be fitted.
 
     Args:
         stage: in which the effect was found.
-        first: the effect.
+        effect: that is shown, whose amplitude becomes an unknown.
     """
     problem = stage.problem
-    at_best = stage.best_of(first)
-    values = first.values_by_label(problem, at_best.amplitude)
-    guesses = {label: own.pop(first.varied) for label, own in values.items()}
+    at_best = stage.best_of(effect)
+    values = effect.values_by_label(problem, at_best.amplitude)
+    guesses = {label: own.pop(effect.varied) for label, own in values.items()}
     gases = {m.label: m.gas for m in problem.curves}
-    labels = list(first.curves)
+    labels = list(effect.curves)
     unknowns = []
     start = []
     # Drop tests have the law of impacts, too: all measurements share its parameter.
-    for label in labels[:1] if first.changes_law else labels:
-        place = None if first.changes_law else label
-        unknown = unknown_of(first.varied, place, gases[label], problem.curves)
+    for label in labels[:1] if effect.changes_law else labels:
+        place = None if effect.changes_law else label
+        unknown = unknown_of(effect.varied, place, gases[label], problem.curves)
         unknowns.append(unknown)
         start.append(unknown.domain.to_free(guesses[label]) / unknown.unit)
-    wider = with_wider_rate_error(problem, first.rate_error(at_best.amplitude))
+    wider = with_wider_rate_error(problem, effect.rate_error(at_best.amplitude))
     fixed = problem.fixed_with(values)
     both = replace(wider, unknowns=(*problem.unknowns, *unknowns), fixed=fixed)
     origin = np.append(stage.origin, start)
@@ -286,7 +294,7 @@ def _beside(stage: _Stage, first: Kind) -> _Stage | None:
     profiles = {
         second: [profile_of(both, second, base, origin)] for second in kinds_of(both, base.flat)
     }
-    return _Stage(both, base, origin, (*stage.shown, first), profiles)
+    return _Stage(both, base, origin, (*stage.shown, effect), profiles)
 
 
 class _Allowed(NamedTuple):

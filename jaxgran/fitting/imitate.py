@@ -88,7 +88,7 @@ class Imitation:
 
     @property
     def held_alone(self) -> int:
-        """The same of the error assuming no other effect, 1.96 standard errors."""
+        """Number of runs whose estimate, assuming no other effect, is 1.96 errors or less off."""
         return int(np.sum(np.abs(self.estimate - self.value) <= NORMAL * self.error))
 
     @property
@@ -234,7 +234,7 @@ def _imitated(
     if model is None:
         model = _particle_model(truth, gas, measurement)
     of_start, of_errors = jax.random.split(key)
-    several: Any = replace(model, replicas=runs * measurement.replicas)  # as all of particles have
+    several: Any = replace(model, replicas=runs * measurement.replicas)  # of particles
     since_start = _times_since_start(measurement, result)
     curve = cool(gas, since_start, model=several, key=of_start, progress=progress)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(of_errors)))
