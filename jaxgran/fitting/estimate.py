@@ -32,6 +32,7 @@ from jaxgran.fitting.result import Fit
 from jaxgran.fitting.rows import SCATTER, WHITE, CurveRows, has_no_measured_errors
 from jaxgran.fitting.search import Descent, Minimum, best_of_starts, minimise
 from jaxgran.fitting.setup import Request, build_problem, problem_with_rate_errors
+from jaxgran.models.base import Limitation
 from jaxgran.models.checks import describe_walls
 from jaxgran.models.scales import scales_at
 from jaxgran.scene.gas import Gas
@@ -395,8 +396,16 @@ def with_messages(
     notes: Iterable[str],
     share: float,
 ) -> Fit:
-    """Return a result with its first line, verdict and reasons; see `measurement_share`."""
-    limitations = []
+    """Return a result with its first line, verdict and reasons.
+
+    Args:
+        request: of the user.
+        result: without words.
+        explanations: the fitted law and its alternatives; None if they were not compared.
+        notes: further reasons.
+        share: of the errors of the measurement in the variances of T, see `measurement_share`.
+    """
+    limitations: dict[str, Limitation] = {}
     notes = list(notes)
     gases = result.gas if isinstance(result.gas, dict) else {"": result.gas}
     for label, m in request.measurements.items():
@@ -405,8 +414,7 @@ def with_messages(
         gas = gases[label]
         N = m.num_particles
         for limitation in request.model.limitations(gas, N):
-            if limitation.words not in {known.words for known in limitations}:
-                limitations.append(limitation)
+            limitations.setdefault(limitation.words, limitation)
         if gas.container is not None:
             notes.append(say("gravity"))
         if N is not None and gas.container is None and "walls" not in m.absent:
@@ -415,7 +423,7 @@ def with_messages(
     return with_words(
         result,
         explanations,
-        tuple(limitations),
+        tuple(limitations.values()),
         notes,
         quick=request.quick,
         measurement_share=share,
