@@ -171,11 +171,13 @@ def _widening(result: Fit) -> list[Alternative]:
 
 
 def _with_effect(alternative: Alternative, amplitude: float, curve: FittedCurve) -> Truth | None:
-    """Return a truth with an effect; None where the effect is not one of `ADDED_ELEMENTS`."""
-    if alternative.name not in ADDED_ELEMENTS or amplitude == 0:
+    """Return a truth with an effect; None for one of amplitude 0, or not in `ADDED_ELEMENTS`."""
+    if alternative.name not in ADDED_ELEMENTS:
         return None
     kind = next(kind for kind in KINDS if kind.name == alternative.name)
     elements = ADDED_ELEMENTS[kind.name](kind.values(amplitude, curve))
+    if amplitude == 0:
+        return None
     return Truth(f"with {alternative.effect}", effect=alternative.effect, elements=elements)
 
 
