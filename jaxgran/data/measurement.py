@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxgran._utils.formatting import text_table
 from jaxgran._utils.validation import (
+    ANY,
     FRACTION,
     NON_NEGATIVE,
     POSITIVE,
@@ -27,7 +28,7 @@ START_TIME = "t0"
 began to cool: the only parameter of a fit that is not a parameter of a gas."""
 
 DENSITY = "density"
-"""Name of a prior that is not of a parameter of a gas: the mass over the volume of a sphere."""
+"""Name of the prior of the mass over the volume of a sphere, which is not a parameter of a gas."""
 
 SMALLEST = 1e-30
 """Smallest value of a measurement that is allowed, SI."""
@@ -39,9 +40,7 @@ MIN_ERROR = 1e-12
 """Smallest allowed relative error of a measurement."""
 
 Priors = dict[str, tuple[Float[Array, "..."], Float[Array, "..."]]]
-"""Known values and their standard errors, SI, by the name of a parameter of a gas, or "density",
-which lets the mass vary, or "t0", the time at which the gas began to cool. Each prior is Gaussian
-in the unconstrained scale (the logarithm of a positive parameter)."""
+"""Known values and their standard errors, SI, by name, as `Measurement` takes them."""
 
 
 class Measurement(eqx.Module):
@@ -123,43 +122,25 @@ class Measurement(eqx.Module):
         if not isinstance(gas, Gas):
             raise ValueError(f"gas must be a jaxgran.Gas, got {type(gas).__name__}")
         gas.check_single()
-        if isinstance(data, CoolingCurve):
-            data.check_measured()
-            _check_magnitudes(data)
-        elif isinstance(data, DropTest):
-            data.check_gas(gas)
-        else:
-            raise ValueError(
-                f"data must be a jaxgran.CoolingCurve or a jaxgran.DropTest, got "
-                f"{type(data).__name__}. Make a curve of arrays by jaxgran.CoolingCurve(t, T), of "
-                "a table of pandas by jaxgran.CoolingCurve.from_pandas(table)"
-            )
-        if num_particles is not None:
-            num_particles = checked_int("num_particles", num_particles, 1)
+        _check_data(data, gas)
         self.gas = gas
         self.data = data
-        self.num_particles = num_particles
+        self.num_particles = _count_or_none("num_particles", num_particles)
         self.replicas = checked_int("replicas", replicas, 1)
-        self.priors = checked_priors(gas, {} if priors is None else priors)
-        self.absent = checked_absent(absent)
-        self.tracked = None if tracked is None else checked_int("tracked", tracked, 1)
-        if tracked is not None and num_particles is not None and tracked > num_particles:
-            raise ValueError(f"tracked must be at most N = {num_particles}, got {tracked}")
+        self.priors = _checked_priors(gas, {} if priors is None else priors)
+        self.absent = _checked_absent(absent)
+        self.tracked = _checked_tracked(tracked, self.num_particles)
         check_bool(
             ensemble_start=ensemble_start, errors_measured=errors_measured, of_energy=of_energy
         )
-        self.of_energy = of_energy
         self.ensemble_start = ensemble_start
         self.calibration_error = checked_float(
             "calibration_error", calibration_error, FRACTION, "0.02 stands for 2 %."
         )
         self.errors_measured = errors_measured
-        self.rounding = checked_rounding({} if rounding is None else rounding, data)
-        if isinstance(guesses, str) or not set(guesses) <= {*gas.domains}:
-            raise ValueError(
-                f"guesses must be a tuple of {', '.join(gas.domains)}, got {guesses!r:.60}"
-            )
-        self.guesses = tuple(guesses)
+        self.of_energy = of_energy
+        self.rounding = _checked_rounding({} if rounding is None else rounding, data)
+        self.guesses = _checked_guesses(guesses, gas)
         self.header = tuple(header)
 
     @property
@@ -185,35 +166,50 @@ class Measurement(eqx.Module):
         return text_table("Measurement", rows)
 
 
-def checked_rounding(rounding: Any, data: CoolingCurve | DropTest) -> dict[str, Array]:
-    """Return last digits of the fields of a curve as arrays, or raise ValueError."""
-    fields = ("temperature", "rotational_temperature")
-    if not isinstance(rounding, dict) or not set(rounding) <= set(fields):
+def _check_data(data: Any, gas: Gas) -> None:
+    """Raise ValueError unless this is a measured curve, or a drop test of spheres of a gas."""
+    if isinstance(data, CoolingCurve):
+        data.check_measured()
+        _check_magnitudes(data)
+    elif isinstance(data, DropTest):
+        data.check_gas(gas)
+    else:
         raise ValueError(
-            f"rounding must be a dictionary of {' and '.join(fields)}, as "
-            f"{{'temperature': 1e-6}}, got {rounding!r:.60}"
+            f"data must be a jaxgran.CoolingCurve or a jaxgran.DropTest, got "
+            f"{type(data).__name__}. Make a curve of arrays by jaxgran.CoolingCurve(t, T), of "
+            "a table of pandas by jaxgran.CoolingCurve.from_pandas(table)"
         )
-    converted = {}
-    for name, digit in rounding.items():
-        converted[name] = float_array(digit, f"rounding of {name}")
-        NON_NEGATIVE.check(f"rounding of {name}", converted[name], "Give the last digit, SI.")
-        shape = converted[name].shape
-        if shape and (not isinstance(data, CoolingCurve) or shape != data.times.shape):
+
+
+def _check_magnitudes(curve: CoolingCurve) -> None:
+    """Raise ValueError for values that cannot be measured, mostly typing or unit errors."""
+    for name, quantity in QUANTITIES.items():
+        given = getattr(curve, name)
+        if given is None or not quantity.measured:
+            continue
+        values = np.asarray(given)
+        smallest = SMALLEST
+        if name.endswith("_error"):
+            with_this_error = getattr(curve, name.removesuffix("_error"))
+            if with_this_error is None:
+                raise ValueError(f"the curve has {name} without the values. Leave it out as well.")
+            smallest = MIN_ERROR * np.asarray(with_this_error)
+        wrong = (values > 0) & ((values < smallest) | (values > LARGEST))
+        if np.any(wrong):
+            i = int(np.argmax(wrong))
             raise ValueError(
-                f"rounding of {name} must be one number or one for each time, got shape {shape}"
+                f"point {i}: {quantity.column} is {values[i]:g}, which cannot be measured. Allowed "
+                f"are {SMALLEST:g} to {LARGEST:g} in SI units, and errors above {MIN_ERROR:g} of "
+                "the value: correct or remove the point"
             )
-    return converted
 
 
-def checked_absent(absent: Any) -> tuple[str, ...]:
-    """Return the names of effects that a user declares absent, or raise ValueError."""
-    if not isinstance(absent, tuple | list) or not set(absent) <= set(ABSENT):
-        raise ValueError(f"absent must be a tuple of {', '.join(ABSENT)}, got {absent!r}")
-    return tuple(absent)
+def _count_or_none(name: str, count: Any) -> int | None:
+    return None if count is None else checked_int(name, count, 1)
 
 
-def checked_priors(gas: Gas, priors: Any) -> Priors:
-    """Check and convert the priors that a user gave.
+def _checked_priors(gas: Gas, priors: Any) -> Priors:
+    """Return priors as arrays.
 
     Raises:
         ValueError: for an unknown name, a value outside its range or an error that is not positive.
@@ -251,28 +247,54 @@ def checked_priors(gas: Gas, priors: Any) -> Priors:
 def prior_domain(gas: Gas, name: str) -> Domain:
     """Return the allowed values of a parameter that may have a prior."""
     if name == START_TIME:
-        return Domain()
-    return POSITIVE if name == DENSITY else gas.domains[name]
+        return ANY
+    if name == DENSITY:
+        return POSITIVE
+    return gas.domains[name]
 
 
-def _check_magnitudes(curve: CoolingCurve) -> None:
-    """Raise ValueError for values that cannot be measured, mostly typing or unit errors."""
-    for name, quantity in QUANTITIES.items():
-        values = getattr(curve, name) if quantity.measured else None
-        if values is None:
-            continue
-        values = np.asarray(values)
-        least = SMALLEST
-        if name.endswith("_error"):
-            of = getattr(curve, name.removesuffix("_error"))
-            if of is None:
-                raise ValueError(f"the curve has {name} without the values. Leave it out as well.")
-            least = MIN_ERROR * np.asarray(of)
-        wrong = (values > 0) & ((values < least) | (values > LARGEST))
-        if np.any(wrong):
-            i = int(np.argmax(wrong))
+def _checked_absent(absent: Any) -> tuple[str, ...]:
+    """Return the names of effects that a user declares absent, or raise ValueError."""
+    if not isinstance(absent, tuple | list) or not set(absent) <= set(ABSENT):
+        raise ValueError(f"absent must be a tuple of {', '.join(ABSENT)}, got {absent!r}")
+    return tuple(absent)
+
+
+def _checked_tracked(tracked: Any, num_particles: int | None) -> int | None:
+    """Return the number of tracked grains, or raise ValueError."""
+    count = _count_or_none("tracked", tracked)
+    if count is not None and num_particles is not None and count > num_particles:
+        raise ValueError(f"tracked must be at most N = {num_particles}, got {count}")
+    return count
+
+
+def _checked_rounding(rounding: Any, data: CoolingCurve | DropTest) -> dict[str, Array]:
+    """Return last digits of the fields of a curve as arrays, or raise ValueError."""
+    fields = ("temperature", "rotational_temperature")
+    if not isinstance(rounding, dict) or not set(rounding) <= set(fields):
+        raise ValueError(
+            f"rounding must be a dictionary of {' and '.join(fields)}, as "
+            f"{{'temperature': 1e-6}}, got {rounding!r:.60}"
+        )
+    converted = {}
+    for name, given in rounding.items():
+        digit = float_array(given, f"rounding of {name}")
+        NON_NEGATIVE.check(f"rounding of {name}", digit, "Give the last digit, SI.")
+        is_number = digit.shape == ()
+        is_of_times = isinstance(data, CoolingCurve) and digit.shape == data.times.shape
+        if not (is_number or is_of_times):
             raise ValueError(
-                f"point {i}: {quantity.column} is {values[i]:g}, which cannot be measured. Allowed "
-                f"are {SMALLEST:g} to {LARGEST:g} in SI units, and errors above {MIN_ERROR:g} of "
-                "the value: correct or remove the point"
+                f"rounding of {name} must be one number or one for each time, got shape "
+                f"{digit.shape}"
             )
+        converted[name] = digit
+    return converted
+
+
+def _checked_guesses(guesses: Any, gas: Gas) -> tuple[str, ...]:
+    """Return names of parameters of a gas, or raise ValueError."""
+    if isinstance(guesses, str) or not set(guesses) <= {*gas.domains}:
+        raise ValueError(
+            f"guesses must be a tuple of {', '.join(gas.domains)}, got {guesses!r:.60}"
+        )
+    return tuple(guesses)

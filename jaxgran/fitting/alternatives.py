@@ -21,7 +21,7 @@ import scipy
 from jaxtyping import Float
 
 from jaxgran.fitting.goodness import SIGNIFICANCE, goodness
-from jaxgran.fitting.kinds import DECLARABLE, SCENE_PARAMETERS, Kind, kinds_of
+from jaxgran.fitting.kinds import Kind, kinds_of
 from jaxgran.fitting.parameters import as_floats, with_parameters
 from jaxgran.fitting.problem import Problem, unknown_of
 from jaxgran.fitting.profiles import (
@@ -47,6 +47,9 @@ AND = ", and "
 
 THEORY_TOLERANCE = 1e3
 """Factor of the tolerance of kinetic theory."""
+
+NUM_BETWEEN = 40
+"""Number of steps of the interpolation from one tried amplitude to the next."""
 
 
 class Alternative(NamedTuple):
@@ -135,19 +138,15 @@ class Explanations(NamedTuple):
 
 
 def compare_alternatives(
-    problem: Problem,
-    minima: list[Minimum],
-    noise: Float[np.ndarray, "p"],
-    is_driven: bool,
+    problem: Problem, minima: list[Minimum], noise: Float[np.ndarray, "p"]
 ) -> Explanations | None:
-    """Compare a fitted law with its alternatives.
+    """Compare a fitted law with its alternatives; a driven gas has none.
 
     Args:
         problem: of a model that supports all alternatives, at the minima of the fit.
         minima: minima of -2 ln L that the data allow.
         noise: standard errors of the free parameters, in their unconstrained scale, that the
             problem does not contain.
-        is_driven: whether the gas is driven, which has no alternatives.
 
     Returns:
         None if the law cannot be computed.
@@ -156,37 +155,59 @@ def compare_alternatives(
     bases = _minima(problem, minima)
     if not bases:
         return None
+    is_driven = any(m.scene.drive is not None for m in problem.curves)
     kinds = [] if is_driven else kinds_of(problem, bases[0].flat)
-    significant = float(scipy.stats.chi2.isf(PREFERENCE_LEVEL / max(len(kinds), 1), 1))
-    found = problem.evaluate(bases[0].flat)
+    significant = _significant_fall(problem, bases[0], len(kinds))
+    stages = _stages(problem, bases, kinds, significant)
+    trials = [trial for stage in stages for trial in stage.trials()]
+    best = min([*bases, *trials], key=lambda trial: trial.value)
+    summary = _Summary(problem, bases[0], best, significant, noise)
+    law = summary.law(bases)
+    by_effects: dict[tuple[Kind, ...], Alternative] = {}
+    for stage in stages:
+        beside = by_effects[stage.shown] if stage.shown else law
+        for kind, trials_of_minima in stage.profiles.items():
+            effects = (*stage.shown, kind)
+            by_effects[effects] = summary.alternative(effects, trials_of_minima, beside)
+    best_first = sorted(by_effects.values(), key=lambda alternative: -alternative.improvement)
+    return Explanations(law, tuple(best_first), significant)
+
+
+def _minima(problem: Problem, minima: list[Minimum]) -> list[Trial]:
+    """Return the minima that the data allow as trials, the deepest one first."""
+    trials = [trial_of(problem, 0.0, minimum.flat, minimum.flat) for minimum in minima]
+    found = sorted((t for t in trials if t is not None), key=lambda trial: trial.value)
+    size = problem.num_free
+    different: list[Trial] = []
+    for trial in found:
+        known = any(np.allclose(trial.flat[:size], x.flat[:size], atol=1e-2) for x in different)
+        if not known and trial.value <= found[0].value + ALLOWED:
+            different.append(trial)
+    return different
+
+
+def _significant_fall(problem: Problem, base: Trial, num_kinds: int) -> float:
+    """Return the decrease of -2 ln L from which an explanation excludes others."""
+    found = problem.evaluate(base.flat)
     if goodness(problem, found)["smooth_p_value"] < SIGNIFICANCE:
-        # Such a curve prefers whatever has less noise.
-        significant = np.inf
+        return np.inf  # such a curve prefers whatever has less noise
+    return float(scipy.stats.chi2.isf(PREFERENCE_LEVEL / max(num_kinds, 1), 1))
+
+
+def _stages(
+    problem: Problem, bases: list[Trial], kinds: list[Kind], significant: float
+) -> list["_Stage"]:
+    """Return the alternatives to a law, then those beside each effect that they show."""
     profiles = {
         kind: [profile_of(problem, kind, base, base.flat) for base in bases] for kind in kinds
     }
     stages = [_Stage(problem, bases[0], bases[0].flat, (), profiles)]
-    while (first := stages[-1].next_effect(significant)) is not None:
-        stage = _beside(stages[-1], first)
+    while (effect := stages[-1].next_effect(significant)) is not None:
+        stage = _beside(stages[-1], effect)
         if stage is None:
             break
         stages.append(stage)
-    trials = [trial for stage in stages for trial in stage.trials()]
-    best = min([*bases, *trials], key=lambda trial: trial.value)
-    summary = _Summary(problem, bases[0], best, significant, noise)
-    law = summary.build((), [[base] for base in bases])
-    alternatives: list[Alternative] = []
-    beside = law
-    for number, stage in enumerate(stages):
-        built = {
-            kind: summary.build((*stage.shown, kind), found, beside)
-            for kind, found in stage.profiles.items()
-        }
-        alternatives += built.values()
-        if number + 1 < len(stages):
-            beside = built[stages[number + 1].shown[-1]]
-    best_first = sorted(alternatives, key=lambda alternative: -alternative.improvement)
-    return Explanations(law, tuple(best_first), significant)
+    return stages
 
 
 class _Stage(NamedTuple):
@@ -234,39 +255,38 @@ class _Stage(NamedTuple):
             if kind.parameters == (WHITE,) and self._gain(kind) > ALLOWED_OVER_ALL:
                 return kind
         first = min(known, key=lambda kind: self.best_of(kind).value)
-        is_first_element = _is_element(first) and not any(map(_is_element, self.shown))
+        shows_element = any(kind.effect for kind in self.shown)
+        is_first_element = bool(first.effect) and not shows_element
         return first if is_first_element and self._gain(first) > significant else None
 
     def _gain(self, kind: Kind) -> float:
         return self.base.value - self.best_of(kind).value
 
 
-def _is_element(kind: Kind) -> bool:
-    return kind.parameters[0] in SCENE_PARAMETERS
-
-
-def _beside(stage: _Stage, first: Kind) -> _Stage | None:
+def _beside(stage: _Stage, effect: Kind) -> _Stage | None:
     """Return the alternatives beside one more effect; None if it cannot be fitted.
 
     Args:
         stage: in which the effect was found.
-        first: the effect.
+        effect: that is shown, whose amplitude becomes an unknown.
     """
     problem = stage.problem
-    at_best = stage.best_of(first)
-    name = first.varied
-    values = first.values_by_label(problem, at_best.amplitude)
-    guesses = {label: own.pop(name) for label, own in values.items()}
-    labels = list(first.curves)
+    at_best = stage.best_of(effect)
+    values = effect.values_by_label(problem, at_best.amplitude)
+    guesses = {label: own.pop(effect.varied) for label, own in values.items()}
     gases = {m.label: m.gas for m in problem.curves}
-    if first.changes_law:  # drop tests have the law of impacts, too
-        unknowns = [unknown_of(name, None, gases[labels[0]], problem.curves)]
-    else:
-        unknowns = [unknown_of(name, x, gases[x], problem.curves) for x in labels]
-    start = [u.domain.to_free(guesses[x]) / u.unit for u, x in zip(unknowns, labels, strict=False)]
-    changed = with_wider_rate_error(problem, first.rate_error(at_best.amplitude))
+    labels = list(effect.curves)
+    unknowns = []
+    start = []
+    # Drop tests have the law of impacts, too: all measurements share its parameter.
+    for label in labels[:1] if effect.changes_law else labels:
+        place = None if effect.changes_law else label
+        unknown = unknown_of(effect.varied, place, gases[label], problem.curves)
+        unknowns.append(unknown)
+        start.append(unknown.domain.to_free(guesses[label]) / unknown.unit)
+    wider = with_wider_rate_error(problem, effect.rate_error(at_best.amplitude))
     fixed = problem.fixed_with(values)
-    both = replace(changed, unknowns=(*problem.unknowns, *unknowns), fixed=fixed)
+    both = replace(wider, unknowns=(*problem.unknowns, *unknowns), fixed=fixed)
     origin = np.append(stage.origin, start)
     base = trial_of(both, 0.0, np.append(at_best.flat, start), origin)
     if base is None:
@@ -274,24 +294,32 @@ def _beside(stage: _Stage, first: Kind) -> _Stage | None:
     profiles = {
         second: [profile_of(both, second, base, origin)] for second in kinds_of(both, base.flat)
     }
-    return _Stage(both, base, origin, (*stage.shown, first), profiles)
+    return _Stage(both, base, origin, (*stage.shown, effect), profiles)
 
 
 class _Allowed(NamedTuple):
-    """Amplitudes that the data allow, and the ranges of the parameters at each of them.
+    """Amplitudes that the data allow, and the ranges of the parameters over them.
 
     Attributes:
-        amplitude: shape (amplitudes,).
-        low, high: ends of the range of each free parameter, in its unconstrained scale.
+        amplitudes: the smallest and the largest one.
+        low, high: range of each free parameter, SI.
     """
 
-    amplitude: Float[np.ndarray, "amplitudes"]
-    low: Float[np.ndarray, "amplitudes p"]
-    high: Float[np.ndarray, "amplitudes p"]
+    amplitudes: tuple[float, float]
+    low: Float[np.ndarray, "p"]
+    high: Float[np.ndarray, "p"]
 
 
 class _Summary(NamedTuple):
-    """What the trials of each alternative are compared with: see `compare_alternatives`."""
+    """What the trials of each alternative are compared with.
+
+    Attributes:
+        problem: of the fit.
+        base: the fitted law.
+        best: the best of all trials in which A has a meaning.
+        significant: decrease of -2 ln L from which an explanation excludes others.
+        noise: see `compare_alternatives`.
+    """
 
     problem: Problem
     base: Trial
@@ -299,117 +327,111 @@ class _Summary(NamedTuple):
     significant: float
     noise: Float[np.ndarray, "p"]
 
-    def build(
-        self,
-        effects: tuple[Kind, ...],
-        profiles: list[list[Trial]],
-        beside: Alternative | None = None,
+    def law(self, bases: list[Trial]) -> Alternative:
+        """Return the law itself, from all its minima."""
+        allowed = self._allowed([[base] for base in bases], self.base.value + ALLOWED, self.base)
+        return Alternative(
+            name="",
+            effect="",
+            amplitude=self.base.amplitude,
+            allowed=allowed.amplitudes,
+            improvement=0.0,
+            estimate=self.problem.estimates(self.base.flat),
+            low=allowed.low,
+            high=allowed.high,
+            preferred=False,
+            distinguishable=True,
+            error_reduction_needed=1.0,
+        )
+
+    def alternative(
+        self, effects: tuple[Kind, ...], profiles: list[list[Trial]], beside: Alternative
     ) -> Alternative:
         """Return an alternative from its trials, interpolated between the amplitudes.
 
         Args:
-            effects: what the alternative adds; the amplitude of the last one is varied. () for the
-                law itself.
+            effects: what the alternative adds; the amplitude of the last one is varied.
             profiles: the trials, from each minimum.
-            beside: the same without the last effect; None for the law itself.
+            beside: the same without the last effect.
         """
-        kind = effects[-1] if effects else None
+        varied = effects[-1]
         # The law without an alternative is not a trial of one that has no amplitudes in between.
-        ends = [trials if kind is None or kind.keeps_A else trials[1:] for trials in profiles]
+        ends = [trials if varied.keeps_A else trials[1:] for trials in profiles]
         best = min((t for trials in ends for t in trials), key=lambda t: t.value, default=self.base)
-        limit = best.value + ALLOWED
-        if kind is not None:
-            limit = max(limit, self.best.value + ALLOWED_OVER_ALL)
-        allowed = self._allowed(profiles, limit)
-        low = self._in_si(np.min(allowed.low, axis=0), best)
-        high = self._in_si(np.max(allowed.high, axis=0), best)
-        estimate = self.problem.estimates(best.flat)
-        wider = 0.0
-        is_excluded = best.value > self.best.value + self.significant
-        if beside is not None and not is_excluded:
-            beyond = max(beside.low[0] - low[0], high[0] - beside.high[0])
-            wider = beyond / abs(beside.estimate[0])
-        known = {parameter: name for name, (parameter, _) in DECLARABLE.items()}
-        names = [known[x.parameters[0]] for x in effects if x.parameters[0] in known]
-        improvement = self.base.value - best.value
-        gained = improvement if beside is None else improvement - beside.improvement
+        limit = max(best.value + ALLOWED, self.best.value + ALLOWED_OVER_ALL)
+        allowed = self._allowed(profiles, limit, best)
+        low = allowed.low
+        high = allowed.high
         restitution = None
-        if kind is not None and beside is not None and not kind.keeps_A:
-            wider = 0.0
+        if not varied.keeps_A:
             low = beside.low
             high = beside.high
-            restitution = constant_restitution(self.problem, best)
+            restitution = _constant_restitution(self.problem, best)
+        widening = 0.0
+        is_excluded = best.value > self.best.value + self.significant
+        if varied.keeps_A and not is_excluded:
+            beyond = max(beside.low[0] - low[0], high[0] - beside.high[0])
+            widening = beyond / abs(beside.estimate[0])
+        improvement = float(self.base.value - best.value)
         return Alternative(
-            name=AND.join(x.name for x in effects),
-            effect=names[0] if names else "",
+            name=AND.join(kind.name for kind in effects),
+            effect=next((kind.effect for kind in effects if kind.effect), ""),
             amplitude=best.amplitude,
-            allowed=(float(np.min(allowed.amplitude)), float(np.max(allowed.amplitude))),
-            improvement=float(improvement),
-            estimate=estimate,
+            allowed=allowed.amplitudes,
+            improvement=improvement,
+            estimate=self.problem.estimates(best.flat),
             low=low,
             high=high,
-            preferred=bool(gained > self.significant),
-            distinguishable=bool(wider < DISTINGUISHABLE_SHARE),
-            error_reduction_needed=float(max(wider / DISTINGUISHABLE_SHARE, 1.0)),
+            preferred=bool(improvement - beside.improvement > self.significant),
+            distinguishable=bool(widening < DISTINGUISHABLE_SHARE),
+            error_reduction_needed=float(max(widening / DISTINGUISHABLE_SHARE, 1.0)),
             restitution=restitution,
         )
 
-    def _allowed(self, profiles: list[list[Trial]], limit: float) -> _Allowed:
-        """Return what the data allow below a limit of -2 ln L, interpolated between the trials."""
+    def _allowed(self, profiles: list[list[Trial]], limit: float, best: Trial) -> _Allowed:
+        """Return what the data allow below a limit of -2 ln L, beside other unknowns of a trial."""
         size = self.problem.num_free
-        rows = []
-        for trials in profiles:
-            values = np.array(
-                [
-                    [t.value, t.amplitude, *t.flat[:size], *np.hypot(t.error, self.noise)]
-                    for t in trials
-                ]
-            )
-            fine = np.linspace(0, len(trials) - 1, 40 * (len(trials) - 1) + 1)
-            known = np.arange(len(trials))
-            rows.append(np.stack([np.interp(fine, known, column) for column in values.T], axis=1))
-        values = np.concatenate(rows)
-        inside = values[values[:, 0] <= limit]
+        columns = np.concatenate([self._interpolated(trials) for trials in profiles])
+        inside = columns[columns[:, 0] <= limit]
+        value, amplitude, middle, error = np.split(inside, [1, 2, 2 + size], axis=1)
         # At each amplitude -2 ln L is a parabola in the parameters. Where one of them matters so
         # little that its logarithm has a large error, it is a parabola in its value instead: the
         # factor exp(h), for small h, becomes 1 + 2 h, which is more than 1 + h.
-        half = np.sqrt(limit - inside[:, :1]) * inside[:, 2 + size :]
+        half = np.sqrt(limit - value) * error
         of_positive = np.log1p(half + np.minimum(half**2 / 2, half))
-        middle = inside[:, 2 : 2 + size]
+        low = middle - half
+        high = middle + np.where(self._is_logarithm, of_positive, half)
         return _Allowed(
-            amplitude=inside[:, 1],
-            low=middle - half,
-            high=middle + np.where(self._is_logarithm, of_positive, half),
+            amplitudes=(float(np.min(amplitude)), float(np.max(amplitude))),
+            low=self._in_si(np.min(low, axis=0), best),
+            high=self._in_si(np.max(high, axis=0), best),
         )
+
+    def _interpolated(self, trials: list[Trial]) -> Float[np.ndarray, "amplitudes columns"]:
+        """Return columns of trials, and between them: -2 ln L, the amplitude, the free parameters
+        in their unconstrained scale, and their errors."""
+        size = self.problem.num_free
+        rows = [
+            [t.value, t.amplitude, *t.flat[:size], *np.hypot(t.error, self.noise)] for t in trials
+        ]
+        known = np.arange(len(trials))
+        fine = np.linspace(0, len(trials) - 1, NUM_BETWEEN * (len(trials) - 1) + 1)
+        return np.stack([np.interp(fine, known, column) for column in np.array(rows).T], axis=1)
 
     @property
     def _is_logarithm(self) -> np.ndarray:
-        """Whether the unconstrained scale of a free parameter is a logarithm."""
-        size = self.problem.num_free
+        """Whether the unconstrained scale of each free parameter is a logarithm."""
         unknowns = self.problem.unknowns
         domains = [u.domain for u in unknowns]
         is_positive = [np.isfinite(x.low) and not np.isfinite(x.high) for x in domains]
-        return np.repeat(is_positive, [u.size for u in unknowns])[:size]
+        return np.repeat(is_positive, [u.size for u in unknowns])[: self.problem.num_free]
 
     def _in_si(self, free: np.ndarray, best: Trial) -> np.ndarray:
         with np.errstate(over="ignore"):
             return self.problem.estimates(np.append(free, best.flat[free.size :]))
 
 
-def _minima(problem: Problem, minima: list[Minimum]) -> list[Trial]:
-    """Return the minima that the data allow as trials, the deepest one first."""
-    trials = [trial_of(problem, 0.0, minimum.flat, minimum.flat) for minimum in minima]
-    found = sorted((t for t in trials if t is not None), key=lambda trial: trial.value)
-    different: list[Trial] = []
-    for trial in found:
-        size = problem.num_free
-        known = any(np.allclose(trial.flat[:size], x.flat[:size], atol=1e-2) for x in different)
-        if not known and trial.value <= found[0].value + ALLOWED:
-            different.append(trial)
-    return different
-
-
-def constant_restitution(problem: Problem, trial: Trial) -> float:
+def _constant_restitution(problem: Problem, trial: Trial) -> float:
     """Return eps of a trial in which it is constant."""
     m = problem.curves[0]
     values = problem.values(trial.flat)[m.label]

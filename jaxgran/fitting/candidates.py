@@ -77,12 +77,14 @@ class Candidate(NamedTuple):
         price: what it takes, in words.
         change: the addition as a function.
         kind: of the addition: two of one kind are not combined.
+        is_fixed: whether it is an experiment of its own, which cannot be combined with others.
     """
 
     name: str
     price: str
     change: Change
     kind: str
+    is_fixed: bool = False
 
 
 def standard_candidates(measurement: Measurement) -> list[Candidate]:

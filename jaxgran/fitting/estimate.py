@@ -1,6 +1,6 @@
 """The estimate of a fit and its result."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -32,13 +32,15 @@ from jaxgran.fitting.result import Fit
 from jaxgran.fitting.rows import SCATTER, WHITE, CurveRows, has_no_measured_errors
 from jaxgran.fitting.search import Descent, Minimum, best_of_starts, minimise
 from jaxgran.fitting.setup import Request, build_problem, problem_with_rate_errors
+from jaxgran.models.base import Limitation
 from jaxgran.models.checks import describe_walls
 from jaxgran.models.scales import scales_at
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.parameters import symbol_of
 
-ROUGHNESS_LIMITS = (1e-4, 1.0)
-"""Range of the first guess of independent errors of T; less than two differences give the first."""
+ERROR_LIMITS = (1e-4, 1.0)
+"""Range of the first guess of the relative standard deviation of independent errors of T. A curve
+of less than three points gives the lower end."""
 
 MAX_DISTANCE = 3.0
 """Factor between measured and fitted T. If `DISTANT_SHARE` of the values differ by more, the scale
@@ -48,136 +50,73 @@ DISTANT_SHARE = 0.8
 """Share of such values: where T has fallen most, a curve in another unit may come near."""
 
 
-class _Ends(NamedTuple):
-    """Where the searches of a fit end.
+class _End(NamedTuple):
+    """Where the searches of a problem end.
 
     Attributes:
-        problem: of the fit, with the errors of T that the data show.
+        problem: of the fit.
         best: the deepest minimum.
         minima: all minima.
-        given: the problem without these errors, with the errors of the cooling rate.
-        goodness: of the fit without these errors.
     """
 
     problem: Problem
     best: Minimum
     minima: list[Minimum]
-    given: Problem
-    goodness: dict[str, Any]
+
+    def evaluate(self) -> Evaluation:
+        """Return -2 ln L at the deepest minimum."""
+        return self.problem.evaluate(self.best.flat)
 
 
 def fit_without_noise(request: Request, max_steps: int, descent: Descent | None = None) -> Fit:
-    """Fit a model without noise, starting at the best of some guesses."""
+    """Fit a model without noise, starting at the best of some guesses.
+
+    Args:
+        request: of the user.
+        max_steps: of each search.
+        descent: a gradient descent in place of Newton's method; None for the latter.
+    """
     problem, first, notes = build_problem(request)
     problem.check_points()
-    ends = _search(problem, first, max_steps, descent)
-    found = ends.problem.evaluate(ends.best.flat)
-    distant = distant_curves(ends.problem, found)
+    without_errors = _search(problem, first, max_steps, descent)
+    end = without_errors
+    # Errors of T that the fit adds would explain any misfit: it is judged without them.
+    quality = goodness(end.problem, end.evaluate())
+    is_explained = end.best.converged and quality["p_value"] >= SIGNIFICANCE
+    if descent is None and not is_explained:
+        end = _with_errors_of_T(without_errors, first, max_steps)
+        if not without_errors.best.converged:
+            found = without_errors.problem.evaluate(end.best.flat[: first.size])
+            quality = goodness(without_errors.problem, found)
+    found = end.evaluate()
+    distant = distant_curves(end.problem, found)
     explanations = None
-    if ends.best.converged and not (request.quick or distant):
-        is_driven = any(m.scene.drive is not None for m in problem.curves)
+    if end.best.converged and not (request.quick or distant):
         noise = np.zeros(problem.num_free)
-        explanations = compare_alternatives(ends.problem, ends.minima, noise, is_driven)
-    result = assembled(request, ends.problem, ends.best, ends.minima, explanations)
-    result = replace(result, **ends.goodness)
+        explanations = compare_alternatives(end.problem, end.minima, noise)
+    result = _result(request, end, explanations, quality)
     if distant:
         notes.append(say("distant", ratio=MAX_DISTANCE))
     elif result.p_value < SIGNIFICANCE and not request.quick:
-        notes += _outlier_notes(ends.given, first, max_steps)
+        notes += _outlier_notes(without_errors.problem, first, max_steps)
     if found.scatter_of_eps is not None:
         notes.append(say("scatter of eps", scatter=found.scatter_of_eps))
-    share = measurement_share(ends.problem, found)
+    share = measurement_share(end.problem, found)
     return with_messages(request, result, explanations, notes, share)
 
 
-def _search(problem: Problem, first: np.ndarray, max_steps: int, descent: Descent | None) -> _Ends:
-    """Return where the searches end, with errors of T if the data show them."""
-    if descent is not None:  # it keeps the errors of the cooling rate that it began with
+def _search(problem: Problem, first: np.ndarray, max_steps: int, descent: Descent | None) -> _End:
+    """Return where the searches end, or raise RuntimeError if no curve is computed there."""
+    if descent is None:
+        end = _found_by_two_searches(problem, first, max_steps)
+    else:  # it keeps the errors of the cooling rate that it began with
         best, minima = best_of_starts(problem, first, max_steps, descent)
-        check_computed(problem, best)
-        return _Ends(problem, best, minima, problem, goodness(problem, problem.evaluate(best.flat)))
-    given, best, minima = _found_by_two_searches(problem, first, max_steps)
-    check_computed(given, best)
-    known = goodness(given, given.evaluate(best.flat))
-    if best.converged and known["p_value"] >= SIGNIFICANCE:
-        return _Ends(given, best, minima, given, known)
-    has_ended = best.converged
-    problem, best, minima = _with_errors_of_T(given, first, best, minima, max_steps)
-    if not has_ended:
-        known = goodness(given, given.evaluate(best.flat[: first.size]))
-    return _Ends(problem, best, minima, given, known)
+        end = _End(problem, best, minima)
+    check_computed(end.problem, end.best)
+    return end
 
 
-def _with_errors_of_T(
-    problem: Problem, first: np.ndarray, best: Minimum, minima: list[Minimum], max_steps: int
-) -> tuple[Problem, Minimum, list[Minimum]]:
-    """Return the problem with independent errors of T that the data show, and its minima.
-
-    Where a curve scatters more than its grains can, and has no errors, the estimates would follow
-    its noise. Without such a curve, or errors, the problem and its minima are returned.
-    """
-    bare = [m for m in problem.curves if has_no_measured_errors(m)]
-    if not bare:
-        return problem, best, minima
-    computed = problem.evaluate(first).curves
-    unknowns = [unknown_of(WHITE, m.label, m.scene, problem.curves) for m in bare]
-    sizes = [_roughness(m, computed[m.label]["temperature"]) for m in bare]
-    wider = replace(problem, unknowns=(*problem.unknowns, *unknowns))
-    wider, end, others = _found_by_two_searches(wider, np.append(first, np.log(sizes)), max_steps)
-    if end.value > best.value - ALLOWED or not end.converged:
-        return problem, best, minima
-    return wider, end, others
-
-
-def _roughness(m: CurveRows, computed: np.ndarray) -> float:
-    """Return the standard deviation of ln T about a smooth curve, from second differences."""
-    used = (m.used[:, 0] > 0) & (m.values[:, 0] > 0)
-    residuals = np.log(m.values[used, 0] / computed[used])
-    second = np.diff(residuals, 2)
-    variance = np.mean(second**2) / 6 if second.size else 0.0
-    return float(np.clip(np.sqrt(variance), *ROUGHNESS_LIMITS))
-
-
-def distant_curves(problem: Problem, found: Evaluation) -> list[str]:
-    """Return the labels of curves that no fit and no alternative comes near.
-
-    All alternatives begin at the same T_0: values that are far off are in another unit, and the
-    search for an alternative would not end.
-    """
-    labels = []
-    for m in problem.curves:
-        T = m.values[:, 0][m.used[:, 0] > 0]
-        computed = found.curves[m.label]["temperature"][m.used[:, 0] > 0]
-        distances = np.abs(np.log(np.maximum(T, TINY) / computed))
-        if np.mean(distances > np.log(MAX_DISTANCE)) >= DISTANT_SHARE:
-            labels.append(m.label)
-    return labels
-
-
-def _outlier_notes(problem: Problem, first: np.ndarray, max_steps: int) -> Iterator[str]:
-    """Yield a clause on far outliers, and the first parameter of a fit without them."""
-    rest, end, left_out = without_outliers(problem, first, max_steps)
-    found = rest.evaluate(end.flat)
-    if not left_out or goodness(rest, found)["p_value"] < SIGNIFICANCE:
-        return
-    times = {m.label: np.asarray(m.curve.times) for m in problem.curves}
-    places = [
-        f"{x.label}: " * bool(x.label) + f"t = {times[x.label][x.time]:.3g} s (row {x.time + 1})"
-        for x in sorted(left_out)
-    ]
-    error = np.sqrt(inverse(found.information)[0, 0]) * rest.slopes(end.flat)[0]
-    without = say(
-        "without outliers",
-        symbol=symbol_of(problem.unknowns[0].name),
-        value=rest.estimates(end.flat)[0],
-        error=error,
-    )
-    yield say("outliers", places=", ".join(places)) + without
-
-
-def _found_by_two_searches(
-    problem: Problem, first: np.ndarray, max_steps: int
-) -> tuple[Problem, Minimum, list[Minimum]]:
+def _found_by_two_searches(problem: Problem, first: np.ndarray, max_steps: int) -> _End:
     """Return the deepest minimum, and those that are nearly as deep, with the problem there.
 
     The first search has the scatter that N gives. The second one finds it, too, with the errors of
@@ -195,10 +134,41 @@ def _found_by_two_searches(
     problem = problem_with_rate_errors(problem, whole(begun.flat))
     near = [whole(m.flat) for m in minima if m.value < begun.value + DEGENERATE]
     minima = [minimise(problem, flat, max_steps) for flat in near]
-    end = min(minima, key=lambda minimum: minimum.value)
+    deepest = min(minima, key=lambda minimum: minimum.value)
     steps = begun.steps + sum(m.steps for m in minima)
-    best = end._replace(steps=steps)
-    return problem, best, minima
+    return _End(problem, deepest._replace(steps=steps), minima)
+
+
+def _with_errors_of_T(end: _End, first: np.ndarray, max_steps: int) -> _End:
+    """Return where the searches end with independent errors of T, if the data show them.
+
+    Where a curve scatters more than its grains can, and has no errors, the estimates would follow
+    its noise. Without such a curve, or errors, the given end is returned.
+    """
+    problem = end.problem
+    bare = [m for m in problem.curves if has_no_measured_errors(m)]
+    if not bare:
+        return end
+    computed = problem.evaluate(first).curves
+    unknowns = [unknown_of(WHITE, m.label, m.scene, problem.curves) for m in bare]
+    sizes = [_guess_of_error(m, computed[m.label]["temperature"]) for m in bare]
+    wider = replace(problem, unknowns=(*problem.unknowns, *unknowns))
+    found = _found_by_two_searches(wider, np.append(first, np.log(sizes)), max_steps)
+    if found.best.value > end.best.value - ALLOWED or not found.best.converged:
+        return end
+    return found
+
+
+def _guess_of_error(m: CurveRows, computed: np.ndarray) -> float:
+    """Return the standard deviation of ln T about a smooth curve, from second differences.
+
+    Those of independent values have 1 + 4 + 1 times their variance.
+    """
+    used = (m.used[:, 0] > 0) & (m.values[:, 0] > 0)
+    residuals = np.log(m.values[used, 0] / computed[used])
+    second = np.diff(residuals, 2)
+    variance = np.mean(second**2) / 6 if second.size else 0.0
+    return float(np.clip(np.sqrt(variance), *ERROR_LIMITS))
 
 
 def check_computed(problem: Problem, end: Minimum) -> None:
@@ -220,85 +190,145 @@ def check_computed(problem: Problem, end: Minimum) -> None:
         )
 
 
-def assembled(
-    request: Request,
-    problem: Problem,
-    end: Minimum,
-    minima: list[Minimum],
-    explanations: Explanations | None,
+def distant_curves(problem: Problem, found: Evaluation) -> list[str]:
+    """Return the labels of curves that no fit and no alternative comes near.
+
+    All alternatives begin at the same T_0: values that are far off are in another unit, and the
+    search for an alternative would not end.
+    """
+    labels = []
+    for m in problem.curves:
+        T = m.values[:, 0][m.used[:, 0] > 0]
+        computed = found.curves[m.label]["temperature"][m.used[:, 0] > 0]
+        distances = np.abs(np.log(np.maximum(T, TINY) / computed))
+        if np.mean(distances > np.log(MAX_DISTANCE)) >= DISTANT_SHARE:
+            labels.append(m.label)
+    return labels
+
+
+def _outlier_notes(problem: Problem, first: np.ndarray, max_steps: int) -> list[str]:
+    """Return a clause on far outliers with the first parameter of a fit without them; [] if such a
+    fit is no better."""
+    rest, end, left_out = without_outliers(problem, first, max_steps)
+    found = rest.evaluate(end.flat)
+    if not left_out or goodness(rest, found)["p_value"] < SIGNIFICANCE:
+        return []
+    times = {m.label: np.asarray(m.curve.times) for m in problem.curves}
+    places = []
+    for value in sorted(left_out):
+        prefix = f"{value.label}: " if value.label else ""
+        time = times[value.label][value.time]
+        places.append(f"{prefix}t = {time:.3g} s (row {value.time + 1})")
+    without = say(
+        "without outliers",
+        symbol=symbol_of(problem.unknowns[0].name),
+        value=rest.estimates(end.flat)[0],
+        error=np.sqrt(inverse(found.information)[0, 0]) * rest.slopes(end.flat)[0],
+    )
+    return [say("outliers", places=", ".join(places)) + without]
+
+
+def _result(
+    request: Request, end: _End, explanations: Explanations | None, quality: dict[str, Any]
 ) -> Fit:
     """Return the result of a fit without words.
 
     Args:
         request: of the user.
-        problem: at its minimum.
-        end: the deepest minimum.
-        minima: all minima.
+        end: of the searches.
         explanations: the fitted law and its alternatives; None if they were not compared.
+        quality: the goodness of fit.
     """
-    found = problem.evaluate(end.flat)
-    p = problem.num_free
-    scale = problem.slopes(end.flat)
+    problem = end.problem
+    best = end.best
+    found = end.evaluate()
     covariance = inverse(found.information)
-    parts = information_by_source(problem, end.flat, found)
-    to_si = scale[:, None] * covariance
-    covariances = {name: (to_si @ part @ to_si.T)[:p, :p] for name, part in parts.items()}
-    spread = covariance_of_minima(problem, end, minima, covariance)
-    if np.any(spread > 0):
-        covariances["other minima"] = spread
-    values = problem.values(end.flat)
-    gases = {}
-    curves: dict[str, CoolingCurve | None] = {}
-    for m in problem.measurements:
-        floats = {n: x for n, x in values[m.label].items() if n in m.scene.domains}
-        gases[m.label] = with_parameters(m.scene, as_jax_arrays(as_floats(floats)))
-        curves[m.label] = None
-        if isinstance(m, CurveRows):
-            curves[m.label] = _as_curve(m, found.curves[m.label])
-    names = titles(problem)
+    values = problem.values(best.flat)
+    gases = {m.label: _fitted_gas(m.scene, values[m.label]) for m in problem.measurements}
+    curves: dict[str, CoolingCurve | None] = dict.fromkeys(gases)
+    for m in problem.curves:
+        curves[m.label] = _as_curve(m, found.curves[m.label])
     is_single = [*gases] == [""]
-    errors = np.sqrt(np.diag(covariance))
-    elements = problem.elements(end.flat)
-    scatter = {
-        e.label or "": (float(np.exp(end.flat[e.place])), float(errors[e.place]))
-        for e in elements
-        if e.name == SCATTER
-    }
-    errors_of_T = {
-        u.label or "": float(error) for u, error in problem.parts(end.flat) if u.name == WHITE
-    }
     return Fit(
-        names=names,
+        names=titles(problem),
         model=problem.model,
         model_name=problem.model.name,
         measurements=request.measurements,
         gas=gases[""] if is_single else gases,
         curve=curves[""] if is_single else curves,
-        estimate=problem.estimates(end.flat),
-        covariances=covariances,
+        estimate=problem.estimates(best.flat),
+        covariances=_covariances(end, covariance),
         ranges=parameter_ranges(problem, explanations),
         alternatives=() if explanations is None else explanations.alternatives,
-        **goodness(problem, found),
+        **quality,
         log_likelihood=-0.5 * found.value,
         residuals=_residuals(problem, found),
-        scatter=scatter,
-        errors_of_T=errors_of_T,
+        scatter=_scatter(problem, best.flat, covariance),
+        errors_of_T={
+            u.label or "": float(error) for u, error in problem.parts(best.flat) if u.name == WHITE
+        },
         scales={m.label: describe_gas(gases[m.label], m) for m in problem.curves},
         start_time={m.label: float(values[m.label].get(START_TIME, 0.0)) for m in problem.curves},
         weights=weights_of_measurements(problem, found),
         undetermined=undetermined(problem, found),
-        other_minima=equally_good_minima(problem, end, minima, covariance),
-        converged=end.converged,
-        iterations=end.steps,
-        trace=end.trace,
+        other_minima=equally_good_minima(problem, best, end.minima, covariance),
+        converged=best.converged,
+        iterations=best.steps,
+        trace=best.trace,
     )
+
+
+def _fitted_gas(scene: Gas, values: dict[str, Any]) -> Gas:
+    known = {name: x for name, x in values.items() if name in scene.domains}
+    return with_parameters(scene, as_jax_arrays(as_floats(known)))
+
+
+def _as_curve(m: CurveRows, computed: dict[str, Any]) -> CoolingCurve:
+    """Return a computed curve without the quantities that the scene does not have."""
+    absent = set()
+    if m.scene.surface is None:
+        absent |= {"rotational_temperature"}
+    if m.scene.container is not None:
+        absent |= {"displacement", "diffusion"}
+    fields = {name: x for name, x in computed.items() if name not in absent}
+    fields["status"] = np.zeros((), int)
+    return CoolingCurve(times=m.curve.times, **as_jax_arrays(fields))
+
+
+def _covariances(end: _End, covariance: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the covariances of the estimates, SI, by the source of the error.
+
+    Args:
+        end: of the searches.
+        covariance: of all unknowns, in their unconstrained scale.
+    """
+    problem = end.problem
+    flat = end.best.flat
+    p = problem.num_free
+    parts = information_by_source(problem, flat, end.evaluate())
+    to_si = problem.slopes(flat)[:, None] * covariance
+    covariances = {name: (to_si @ part @ to_si.T)[:p, :p] for name, part in parts.items()}
+    of_minima = covariance_of_minima(problem, end.best, end.minima, covariance)
+    if np.any(of_minima > 0):
+        covariances["other minima"] = of_minima
+    return covariances
+
+
+def _scatter(
+    problem: Problem, flat: np.ndarray, covariance: np.ndarray
+) -> dict[str, tuple[float, float]]:
+    """Return the scatter of each curve over the scatter of N grains, and its standard error."""
+    errors = np.sqrt(np.diag(covariance))
+    return {
+        e.label or "": (float(np.exp(flat[e.place])), float(errors[e.place]))
+        for e in problem.elements(flat)
+        if e.name == SCATTER
+    }
 
 
 def titles(problem: Problem) -> tuple[str, ...]:
     """Return the names of the free parameters."""
-    ends = np.cumsum([u.size for u in problem.unknowns])
-    free = zip(problem.unknowns, ends, strict=True)
-    return tuple(u.title for u, end in free if end <= problem.num_free)
+    return tuple(_places(problem))
 
 
 def parameter_ranges(
@@ -308,13 +338,23 @@ def parameter_ranges(
     if explanations is None:
         return {}
     low, high = explanations.ranges()
-    sizes = [u.size for u in problem.unknowns if u.title in titles(problem)]
-    ends = np.cumsum(sizes)
-    places = zip(titles(problem), ends, sizes, strict=False)
-    return {name: (low[end - n : end], high[end - n : end]) for name, end, n in places}
+    return {name: (low[place], high[place]) for name, place in _places(problem).items()}
+
+
+def _places(problem: Problem) -> dict[str, slice]:
+    """Return the places of the free parameters in the array of the unknowns, by name."""
+    places = {}
+    begin = 0
+    for u in problem.unknowns:
+        end = begin + u.size
+        if end <= problem.num_free:
+            places[u.title] = slice(begin, end)
+        begin = end
+    return places
 
 
 def _residuals(problem: Problem, found: Evaluation) -> dict[str, dict[str, np.ndarray]]:
+    """Return the residuals by label, and by field of the curve or "drop test"."""
     residuals: dict[str, dict[str, np.ndarray]] = {m.label: {} for m in problem.measurements}
     by_label = {m.label: m for m in problem.curves}
     for row in found.rows:
@@ -328,16 +368,6 @@ def _residuals(problem: Problem, found: Evaluation) -> dict[str, dict[str, np.nd
         if by_label[row.label].uses_rotation:
             residuals[row.label]["rotational_temperature"] = of_rotation
     return residuals
-
-
-def _as_curve(m: CurveRows, computed: dict[str, Any]) -> CoolingCurve:
-    """Return a computed curve without the quantities that the scene does not have."""
-    absent = () if m.scene.surface is not None else ("rotational_temperature",)
-    if m.scene.container is not None:
-        absent += ("displacement", "diffusion")
-    fields = {name: x for name, x in computed.items() if name not in absent}
-    fields["status"] = np.zeros((), int)
-    return CoolingCurve(times=m.curve.times, **as_jax_arrays(fields))
 
 
 def describe_gas(gas: Gas, m: CurveRows) -> dict[str, float]:
@@ -366,8 +396,16 @@ def with_messages(
     notes: Iterable[str],
     share: float,
 ) -> Fit:
-    """Return a result with its first line, verdict and reasons; see `measurement_share`."""
-    limitations = []
+    """Return a result with its first line, verdict and reasons.
+
+    Args:
+        request: of the user.
+        result: without words.
+        explanations: the fitted law and its alternatives; None if they were not compared.
+        notes: further reasons.
+        share: of the errors of the measurement in the variances of T, see `measurement_share`.
+    """
+    limitations: dict[str, Limitation] = {}
     notes = list(notes)
     gases = result.gas if isinstance(result.gas, dict) else {"": result.gas}
     for label, m in request.measurements.items():
@@ -376,8 +414,7 @@ def with_messages(
         gas = gases[label]
         N = m.num_particles
         for limitation in request.model.limitations(gas, N):
-            if limitation.words not in {known.words for known in limitations}:
-                limitations.append(limitation)
+            limitations.setdefault(limitation.words, limitation)
         if gas.container is not None:
             notes.append(say("gravity"))
         if N is not None and gas.container is None and "walls" not in m.absent:
@@ -386,7 +423,7 @@ def with_messages(
     return with_words(
         result,
         explanations,
-        tuple(limitations),
+        tuple(limitations.values()),
         notes,
         quick=request.quick,
         measurement_share=share,

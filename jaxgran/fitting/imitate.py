@@ -2,12 +2,13 @@
 
 import warnings
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 from tqdm import tqdm
 
 from jaxgran._utils.formatting import text_table
@@ -26,6 +27,7 @@ from jaxgran.models.cool import cool
 from jaxgran.models.dsmc import DSMC
 from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.scene.gas import Gas
 from jaxgran.scene.parameters import symbol_of
 
 TOLERANCE = 0.02
@@ -86,7 +88,7 @@ class Imitation:
 
     @property
     def held_alone(self) -> int:
-        """The same of the error assuming no other effect, 1.96 standard errors."""
+        """Number of runs whose estimate, assuming no other effect, is 1.96 errors or less off."""
         return int(np.sum(np.abs(self.estimate - self.value) <= NORMAL * self.error))
 
     @property
@@ -99,20 +101,25 @@ class Imitation:
     @property
     def headline(self) -> str:
         """How many ranges held the true value, in a sentence."""
-        text = f"the range held the true {symbol_of(self.parameter)} in {self.held} of {self.runs} "
-        return text + f"imitations, its median width is {100 * self.width:.0f} %"
+        return (
+            f"the range held the true {symbol_of(self.parameter)} in {self.held} of {self.runs} "
+            f"imitations, its median width is {100 * self.width:.0f} %"
+        )
 
     def __repr__(self) -> str:
         """Table of the shares of the runs."""
+        counts = [f"{grade} {self.grades.count(grade)}" for grade in sorted({*self.grades})]
         rows = [
             ("truth", f"{self.truth}, {self.value:.4g}, by {self.model_name}"),
             (CONDITIONAL, f"held it in {self.held_alone} of {self.runs}"),
-            ("verdicts", _counted(self.grades)),
+            ("verdicts", ", ".join(counts)),
         ]
         if self.runs < self.asked:
             rows.append(("interrupted", f"after {self.runs} of {self.asked} runs"))
-        lines = [text_table(self.headline, rows)]
-        return "\n".join(lines if self.strongest is None else [*lines, repr(self.strongest)])
+        tables = [text_table(self.headline, rows)]
+        if self.strongest is not None:
+            tables.append(repr(self.strongest))
+        return "\n".join(tables)
 
 
 def imitate(
@@ -155,24 +162,25 @@ def imitate(
     """
     check_bool(progress=progress)
     runs = checked_int("runs", runs, 2)
-    measurement = _checked(result, runs)
+    _check(result, runs)
+    measurement = _at_the_estimate(result)
     key = checked_key(key)
     key = jax.random.key(0) if key is None else key
+    imitated = partial(_imitated, result=result, runs=runs, model=model, progress=progress)
     strongest = strongest_effect(result)
-    found = _imitated(result, measurement, AS_GIVEN, runs, model, key, progress)
+    found = imitated(AS_GIVEN, measurement, key=key)
     if strongest is None or found.runs < runs:
         return found
-    truth, values = strongest
-    shifted = replace(measurement, gas=measurement.gas.replace(**values))
+    beside = replace(measurement, gas=measurement.gas.replace(**strongest.values))
     try:
-        other = _imitated(result, shifted, truth, runs, model, jax.random.fold_in(key, 1), progress)
+        other = imitated(strongest.truth, beside, key=jax.random.fold_in(key, 1))
     except KeyboardInterrupt:
         return found
     return replace(found, strongest=other)
 
 
-def _checked(result: Any, runs: int) -> Measurement:
-    """Return the measurement of a fit with the fitted gas, or raise ValueError."""
+def _check(result: Any, runs: int) -> None:
+    """Raise ValueError unless a result can be imitated."""
     if not isinstance(result, Fit):
         raise ValueError(
             f"expected the result of jaxgran.fit, got a {type(result).__name__}: call "
@@ -196,74 +204,103 @@ def _checked(result: Any, runs: int) -> Measurement:
             "imitate counts ranges of the first free parameter, which must be one of the gas, got "
             f"{result.names[0]}: free another one first"
         )
+
+
+def _at_the_estimate(result: Fit) -> Measurement:
+    """Return the measurement of a fit, of the fitted gas, with the errors that count."""
+    measurement = result.measurements[""]
     curve = replace(measurement.curve, displacement=None, displacement_error=None)
     priors = dict(measurement.priors)
     if START_TIME in priors:
-        priors[START_TIME] = jnp.asarray(result.start_time[""]), priors[START_TIME][1]
-    imitated = replace(measurement, gas=result.gas, data=curve, rounding={}, priors=priors)
+        _, error = priors[START_TIME]
+        priors[START_TIME] = jnp.asarray(result.start_time[""]), error
+    fitted = replace(measurement, gas=result.gas, data=curve, rounding={}, priors=priors)
     # Particles start with exactly T_0, so that it is the T_0 of each run.
-    return replace(with_errors_that_count(imitated), ensemble_start=False)
+    return replace(with_errors_that_count(fitted), ensemble_start=False)
 
 
 def _imitated(
-    result: Fit,
-    measurement: Measurement,
     truth: Truth,
+    measurement: Measurement,
+    *,
+    key: PRNGKeyArray,
+    result: Fit,
     runs: int,
     model: AbstractModel | None,
-    key: PRNGKeyArray,
     progress: bool,
 ) -> Imitation:
-    """Return fits of runs of a truth."""
+    """Return fits of runs of a truth, with the measurement at its values."""
     gas = truth.gas(measurement.gas)
-    N = measurement.num_particles
-    assert N is not None
-    times = measurement.curve.times
-    if model is None and "container" in truth.elements:  # these walls do not enclose N grains
-        model = DSMC(N)
     if model is None:
-        models = (DSMC(N, replicas=MANY_RUNS), HardSpheres(N, replicas=MANY_RUNS))
-        model = choose_model(gas, times, TOLERANCE, N, models=models).model
-    several: Any = replace(model, replicas=runs * measurement.replicas)
+        model = _particle_model(truth, gas, measurement)
     of_start, of_errors = jax.random.split(key)
-    since = times - jnp.asarray(result.start_time[""])
-    if since[0] < 0:
-        raise ValueError(
-            f"the gas of this fit began at t0 = {result.start_time['']:g} s, after the first time: "
-            "imitations begin with the gas. Leave the earlier rows out"
-        )
-    curve = cool(gas, since, model=several, key=of_start, progress=progress)
+    several: Any = replace(model, replicas=runs * measurement.replicas)  # of particles
+    since_start = _times_since_start(measurement, result)
+    curve = cool(gas, since_start, model=several, key=of_start, progress=progress)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(of_errors)))
     twins = imitations(measurement, result, curve, runs, rng)
-    without = {"softness", "correlations"} if isinstance(model, DSMC) else {"softness"}
-    theory = KineticTheory(corrections=KineticTheory.all_corrections - without)
-    fits: list[Fit] = []
-    bar = tqdm(twins, desc="fits", delay=3, disable=None if progress else True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        try:
-            for one in bar:
-                fits.append(fit(one, model=theory, free=result.names))
-        except KeyboardInterrupt:
-            if not fits:
-                raise
+    fits = _fits(twins, _theory_of(model), result.names, progress)
     name = result.names[0]
-    ends = np.array([[np.ravel(x)[0] for x in f.ranges.get(name, (np.nan,) * 2)] for f in fits])
-    values = np.array([[np.ravel(x)[0] for x in f.value(f.names[0])] for f in fits])
+    ranges = [found.ranges.get(name, (np.nan, np.nan)) for found in fits]
+    values = [found.value(name) for found in fits]
     return Imitation(
         truth=truth.name,
         parameter=name,
         value=float(np.ravel(measurement.gas.value(name))[0]),
         model_name=model.name,
         asked=runs,
-        low=ends[:, 0],
-        high=ends[:, 1],
-        estimate=values[:, 0],
-        error=values[:, 1],
-        grades=tuple(f.grade for f in fits),
+        low=_first_elements([low for low, _ in ranges]),
+        high=_first_elements([high for _, high in ranges]),
+        estimate=_first_elements([estimate for estimate, _ in values]),
+        error=_first_elements([error for _, error in values]),
+        grades=tuple(found.grade for found in fits),
     )
 
 
-def _counted(grades: tuple[str, ...]) -> str:
-    """Return how often each verdict came."""
-    return ", ".join(f"{grade} {grades.count(grade)}" for grade in sorted({*grades}))
+def _particle_model(truth: Truth, gas: Gas, measurement: Measurement) -> AbstractModel:
+    """Return the model of N particles that imitates a gas."""
+    N = measurement.num_particles
+    assert N is not None
+    if "container" in truth.elements:  # these walls do not enclose N grains
+        return DSMC(N)
+    models = (DSMC(N, replicas=MANY_RUNS), HardSpheres(N, replicas=MANY_RUNS))
+    return choose_model(gas, measurement.curve.times, TOLERANCE, N, models=models).model
+
+
+def _times_since_start(measurement: Measurement, result: Fit) -> Float[Array, "times"]:
+    """Return the times since the fitted t0, or raise ValueError if one of them is before it."""
+    t0 = result.start_time[""]
+    since_start = measurement.curve.times - jnp.asarray(t0)
+    if since_start[0] < 0:
+        raise ValueError(
+            f"the gas of this fit began at t0 = {t0:g} s, after the first time: imitations begin "
+            "with the gas. Leave the earlier rows out"
+        )
+    return since_start
+
+
+def _theory_of(model: AbstractModel) -> KineticTheory:
+    """Return kinetic theory of the gas that a model simulates."""
+    without = {"softness", "correlations"} if isinstance(model, DSMC) else {"softness"}
+    return KineticTheory(corrections=KineticTheory.all_corrections - without)
+
+
+def _fits(
+    measurements: list[Measurement], theory: KineticTheory, free: tuple[str, ...], progress: bool
+) -> list[Fit]:
+    """Return the fits of imitations, those before an interruption; without any it is raised."""
+    fits: list[Fit] = []
+    bar = tqdm(measurements, desc="fits", delay=3, disable=None if progress else True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        try:
+            for measurement in bar:
+                fits.append(fit(measurement, model=theory, free=free))
+        except KeyboardInterrupt:
+            if not fits:
+                raise
+    return fits
+
+
+def _first_elements(values: list[Any]) -> Float[np.ndarray, "runs"]:
+    return np.array([np.ravel(value)[0] for value in values])

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -53,17 +53,26 @@ the energy (`jaxgran.models.error_model.WALL_ERROR`)."""
 MIN_WALL_SIDE = 4.0
 """Smallest side of that box, in diameters."""
 
-DECLARABLE = {
-    "walls": ("wall_side", "container_side, wall_restitution"),
-    "roughness": ("tangential_restitution", "beta_t, T_rot"),
-    "drag": ("drag_rate", "gamma"),
-    "friction": ("friction", "friction"),
-}
-"""Parameter of each of the effects `jaxgran.data.header.ABSENT`, and what describes it in a
-file."""
 
-SCENE_PARAMETERS = tuple(parameter for parameter, _ in DECLARABLE.values())
-"""The parameters of elements of a scene, beside which second effects are tried."""
+class Declarable(NamedTuple):
+    """An effect of the scene that a user may declare absent.
+
+    Attributes:
+        parameter: the parameter that identifies it.
+        keys: what describes it in a file.
+    """
+
+    parameter: str
+    keys: str
+
+
+DECLARABLE = {
+    "walls": Declarable("wall_side", "container_side, wall_restitution"),
+    "roughness": Declarable("tangential_restitution", "beta_t, T_rot"),
+    "drag": Declarable("drag_rate", "gamma"),
+    "friction": Declarable("friction", "friction"),
+}
+"""The effects `jaxgran.data.header.ABSENT`."""
 
 WALLS_ADDED = "walls that dissipate energy"
 DRAG_ADDED = "linear drag, as in air"
@@ -121,6 +130,12 @@ class Kind:
     def varied(self) -> str:
         """The parameter that the amplitude sets."""
         return self.amplitude_sets or self.parameters[0]
+
+    @property
+    def effect(self) -> str:
+        """Name in `DECLARABLE`; "" for an error of the measurement or another law of impacts."""
+        names = {known.parameter: name for name, known in DECLARABLE.items()}
+        return names.get(self.parameters[0], "")
 
     def values_by_label(self, problem: Problem, amplitude: float) -> dict[str, dict[str, float]]:
         """Return the values of parameters in each measurement that it changes."""
@@ -259,7 +274,7 @@ def kinds_of(problem: Problem, flat: np.ndarray) -> list[Kind]:
 def _is_open(kind: Kind, problem: Problem, rows: CurveRows) -> bool:
     """Tell whether a curve may have what an alternative adds, without its file saying so."""
     unknowns = {u.name for u in problem.unknowns if u.label in (None, rows.label)}
-    absent = {DECLARABLE[name][0] for name in rows.measurement.absent}
+    absent = {DECLARABLE[name].parameter for name in rows.measurement.absent}
     described = unknowns | absent | {*rows.scene.domains}
     # Spheres of unequal sizes have neither walls nor roughness.
     supported = {FLOOR, WHITE, START_TIME, *rows.gas.domains}
@@ -268,6 +283,41 @@ def _is_open(kind: Kind, problem: Problem, rows: CurveRows) -> bool:
         and supported.issuperset(kind.parameters)
         and kind.applies(rows, unknowns)
     )
+
+
+def _fitted_curves(problem: Problem, flat: np.ndarray) -> dict[str, FittedCurve]:
+    values = problem.values(flat)
+    computed = problem.evaluate(flat).curves
+    curves = {}
+    for m in problem.curves:
+        T = computed[m.label]["temperature"]
+        T_0 = float(values[m.label].get("temperature", m.scene.temperature))
+        t0 = float(values[m.label].get(START_TIME, 0.0))
+        curves[m.label] = FittedCurve(
+            scene=m.scene,
+            rate=initial_rate(np.asarray(m.curve.times) - t0, np.log(T / T_0)),
+            lowest=float(np.min(T[m.used[:, 0] > 0])),
+        )
+    return curves
+
+
+def initial_rate(times: Float[np.ndarray, "n"], log_T: Float[np.ndarray, "n"]) -> float:
+    """Return the cooling rate -d ln T/dt at the start, 1/s, from the time in which T halves.
+
+    Between the start and this time Haff's law of viscoelastic spheres is taken to hold,
+    ``T/T_0 = (1 + t/tau)^(-5/3)``, whose rate at the start is ``5/(3 tau)``. Where T does not
+    halve, the last time is taken.
+
+    Args:
+        times: since the start, s.
+        log_T: ln T/T_0 at these times.
+
+    Reference: Brilliantov & Poeschel, Phys. Rev. E 61, 5573 (2000).
+    """
+    halved = np.flatnonzero((log_T < -np.log(2)) & (times > 0))
+    at = halved[0] if halved.size else -1
+    time_over_tau = np.expm1(-0.6 * min(log_T[at], -1e-6))
+    return float(5 / 3 * time_over_tau / max(times[at], 1e-300))
 
 
 def side_of_walls(gas: Gas, rate: float) -> float:
@@ -280,35 +330,3 @@ def side_of_walls(gas: Gas, rate: float) -> float:
     flux = 2 * np.sqrt(float(gas.temperature) / (2 * np.pi))
     side = 2 * (1 - WALL_RESTITUTION**2) * flux / max(rate, 1e-300) + float(gas.diameter)
     return max(side, MIN_WALL_SIDE * float(gas.diameter))
-
-
-def _fitted_curves(problem: Problem, flat: np.ndarray) -> dict[str, FittedCurve]:
-    values = problem.values(flat)
-    computed = problem.evaluate(flat).curves
-    curves = {}
-    for m in problem.curves:
-        curve = computed[m.label]
-        rate = _initial_rate(m, values[m.label], curve)
-        lowest = float(np.min(curve["temperature"][m.used[:, 0] > 0]))
-        curves[m.label] = FittedCurve(m.scene, rate, lowest)
-    return curves
-
-
-def _initial_rate(m: CurveRows, values: dict[str, Any], curve: dict[str, Any]) -> float:
-    """Return the cooling rate at the start of a fitted curve, 1/s."""
-    T_0 = float(values.get("temperature", m.scene.temperature))
-    times = np.asarray(m.curve.times) - float(values.get(START_TIME, 0.0))
-    return initial_rate(times, np.log(curve["temperature"] / T_0))
-
-
-def initial_rate(times: Float[np.ndarray, "n"], log_T: Float[np.ndarray, "n"]) -> float:
-    """Return the cooling rate at the start, 1/s, from the time in which T halves.
-
-    Args:
-        times: since the start, s.
-        log_T: ln T/T_0 at these times.
-    """
-    fallen = np.flatnonzero((log_T < -np.log(2)) & (times > 0))
-    at = fallen[0] if fallen.size else -1
-    cooled = np.expm1(-0.6 * min(log_T[at], -1e-6))  # 1 + t/tau = T^(-3/5)
-    return float(5 / 3 * cooled / max(times[at], 1e-300))

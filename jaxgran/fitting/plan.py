@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.curve import WITH_ERRORS, CoolingCurve
 from jaxgran.data.measurement import Measurement
+from jaxgran.fitting import report
 from jaxgran.fitting.candidates import (
     Candidate,
     Change,
@@ -21,7 +22,6 @@ from jaxgran.fitting.candidates import (
 )
 from jaxgran.fitting.fit import HOW_TO_MEASURE, fit
 from jaxgran.fitting.measured_rows import with_errors_that_count
-from jaxgran.fitting.report import table
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.setup import with_values_of
 from jaxgran.fitting.twins import AS_GIVEN, Truth, truths_of, twin
@@ -39,6 +39,9 @@ OPEN_WIDTH = 100.0
 
 DATA = "the measurement"
 """Name of what is planned in messages."""
+
+AS_IT_IS = Candidate("as it is", price="", change=lambda measurement: measurement, kind="")
+"""The experiment without an addition."""
 
 
 class Expected(NamedTuple):
@@ -100,10 +103,11 @@ class Plan:
     @property
     def headline(self) -> str:
         """The range to expect, and the best addition, in a sentence."""
-        text = f"{symbol_of(self.parameter)} is expected {_range(self.present, self.unit)} (95 %)"
-        best = self.additions[:1]
-        if best and best[0].gain > 1:
-            text += f"; with {best[0].name} {_range(best[0], self.unit)}"
+        expected = _range_in_words(self.present, self.unit)
+        text = f"{symbol_of(self.parameter)} is expected {expected} (95 %)"
+        if self.additions and self.additions[0].gain > 1:
+            best = self.additions[0]
+            text += f"; with {best.name} {_range_in_words(best, self.unit)}"
         return text
 
     @property
@@ -114,13 +118,16 @@ class Plan:
     @property
     def table(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
         """Head and rows of the table of the ranges, the best addition first."""
-        rows = [self.present, *self.additions, *([] if self.pair is None else [self.pair])]
+        rows = [self.present, *self.additions]
+        if self.pair is not None:
+            rows.append(self.pair)
         symbol = f"{symbol_of(self.parameter)} {self.unit}".strip()
+        head = ("", symbol, "width", "of the truths", "gain", "price")
         cells = [
             (x.name, _ends(x), _percent(x.width), _spread(x), f"{x.gain:.2f}", x.price)
             for x in rows
         ]
-        return ("", symbol, "width", "of the truths", "gain", "price"), cells
+        return head, cells
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -133,11 +140,11 @@ class Plan:
 
     def __repr__(self) -> str:
         """Table of the ranges."""
-        head, cells = self.table
-        long = max(len(row[-1]) for row in cells)
-        aligned = [(*row[:-1], row[-1].ljust(long)) for row in (head, *cells)]
-        rows = table(aligned[0], aligned[1:])
-        return "\n".join([f"{self.headline}.", "", *rows, "", *self.notes])
+        head, rows = self.table
+        length = max(len(price) for *_, price in rows)
+        aligned = [(*numbers, price.ljust(length)) for *numbers, price in (head, *rows)]
+        lines = report.table(aligned[0], aligned[1:])
+        return "\n".join([f"{self.headline}.", "", *lines, "", *self.notes])
 
 
 def plan(
@@ -184,217 +191,34 @@ def plan(
     """
     _check(measurement)
     measurement = with_errors_that_count(measurement)
-    listed = None if candidates is None else _of_user(candidates)
+    listed = None if candidates is None else _candidates_of_user(candidates)
     is_planned = measurement.curve.status is not None
     base = twin(measurement) if is_planned else _at_its_fit(measurement, free)
-    central = _fit(DATA, {"": base}, free)
-    names = central.names
-    if names[0] not in base.gas.domains:
-        raise ValueError(f"a plan needs a parameter of the gas first in free, got {names}")
+    central = _fit(DATA, base, free=free)
+    parameter = central.names[0]
+    if parameter not in base.gas.domains:
+        raise ValueError(f"a plan needs a parameter of the gas first in free, got {central.names}")
     truths = truths_of(base, central)
-    present = _Row(Candidate("as it is", "", _unchanged, ""), {"": base}, names)
-    present.ends[AS_GIVEN.name] = _relative(central, names[0], AS_GIVEN, base.gas)
+    ranges = {AS_GIVEN.name: _range_over_truth(central, parameter, base.gas)}
+    present = _Experiment(AS_IT_IS, {"": base}, central.names, ranges)
     listed = standard_candidates(base) if listed is None else listed
-    rows = _compared(listed, base, present)
-    best = _best(rows)
-    for row in (present, *best):
-        for truth in truths[1:]:
-            row.add(truth)
-    pairs = _compared(_pairs(best), base, present)
-    rows.sort(key=lambda row: (len(row.ends) == 1, -row.gain(present)))
+    experiments = _with_additions(present, listed)
+    best = _best_of_each_kind(experiments)
+    for experiment in (present, *best):
+        for truth in truths:
+            experiment.add_range(truth)
+    pairs = _with_additions(present, _pairs(best))
+    # Those that were compared for all truths come first.
+    experiments.sort(key=lambda x: (len(x.ranges) == 1, -x.gain_over(present)))
     return Plan(
-        parameter=names[0],
-        truth=float(np.ravel(base.gas.value(names[0]))[0]),
+        parameter=parameter,
+        truth=_number(base.gas, parameter),
         present=present.expected(present),
-        additions=tuple(row.expected(present) for row in rows),
+        additions=tuple(x.expected(present) for x in experiments),
         pair=pairs[0].expected(present) if pairs else None,
         truths=tuple(truth.name for truth in truths),
         measurement=base,
     )
-
-
-@dataclass
-class _Row:
-    """An experiment, and its ranges for some truths.
-
-    Attributes:
-        candidate: the addition.
-        measurements: the experiment, by label.
-        names: of the free parameters.
-        ends: low and high ends of the range of the first one over its true value, by truth.
-    """
-
-    candidate: Candidate
-    measurements: dict[str, Measurement]
-    names: tuple[str, ...]
-    ends: dict[str, tuple[float, float]] = field(default_factory=dict)
-
-    def add(self, truth: Truth) -> None:
-        """Compute the range for a truth, unless its effect is known to be absent."""
-        if any(truth.effect in m.absent for m in self.measurements.values()):
-            return
-        twins = {label: twin(m, truth) for label, m in self.measurements.items()}
-        result = _fit(f"candidate {self.candidate.name!r}", twins, self.names)
-        gas = next(iter(self.measurements.values())).gas
-        self.ends[truth.name] = _relative(result, self.names[0], truth, gas)
-
-    def width(self, truth: str) -> float:
-        """Return the width of the range for a truth, over the true value; `OPEN_WIDTH` at most."""
-        low, high = self.ends[truth]
-        return min(high - low, OPEN_WIDTH)
-
-    def gain(self, present: "_Row") -> float:
-        """Return the width without the addition over that with it, the median over truths."""
-        pairs = [(present.width(truth), self.width(truth)) for truth in self.ends]
-        return float(np.median([a / max(b, 1e-300) for a, b in pairs]))
-
-    def expected(self, present: "_Row") -> Expected:
-        """Return the range to expect."""
-        low, high = self.ends[AS_GIVEN.name]
-        widths = [self.width(truth) for truth in self.ends]
-        gas = next(iter(present.measurements.values())).gas
-        scale = float(np.ravel(gas.value(self.names[0]))[0])
-        return Expected(
-            name=self.candidate.name,
-            price=self.candidate.price,
-            low=low * scale,
-            high=high * scale,
-            width=self.width(AS_GIVEN.name),
-            median=float(np.median(widths)),
-            smallest=min(widths),
-            largest=max(widths),
-            gain=self.gain(present),
-        )
-
-
-def _compared(candidates: Sequence[Candidate], base: Measurement, present: _Row) -> list[_Row]:
-    """Return the additions that apply, for the given values, the best one first."""
-    rows = []
-    for candidate in candidates:
-        changed = candidate.change(base)
-        if changed is None:
-            continue
-        changed = {"": changed} if isinstance(changed, Measurement) else changed
-        if not isinstance(changed, dict):
-            raise ValueError(
-                f"candidate {candidate.name!r} must give a jaxgran.Measurement, several by label "
-                f"or None, got a {type(changed).__name__}"
-            )
-        row = _Row(candidate, _of_this_material(changed, base, present.names), present.names)
-        row.add(AS_GIVEN)
-        rows.append(row)
-    return sorted(rows, key=lambda row: -row.gain(present))
-
-
-def _best(rows: list[_Row]) -> list[_Row]:
-    """Return the best additions of different kinds."""
-    best: dict[str, _Row] = {}
-    for row in rows:
-        best.setdefault(row.candidate.kind, row)
-    return list(best.values())[:NUM_BEST]
-
-
-def _pairs(rows: list[_Row]) -> list[Candidate]:
-    """Return the combinations of two of some additions that are functions."""
-    parts = [row.candidate for row in rows if not _is_fixed(row.candidate)]
-    return [
-        Candidate(f"{a.name} + {b.name}", "both", partial(combined, a.change, b.change), "pair")
-        for a, b in combinations(parts, 2)
-    ]
-
-
-def _is_fixed(candidate: Candidate) -> bool:
-    """Whether an addition is a measurement, and no function of one."""
-    return getattr(candidate.change, "func", None) is _instead
-
-
-def _of_user(candidates: Any) -> list[Candidate]:
-    """Return the candidates of a user, or raise ValueError."""
-    is_dictionary = isinstance(candidates, dict) and bool(candidates)
-    if not is_dictionary or not all(
-        callable(x) or isinstance(x, Measurement | dict) for x in candidates.values()
-    ):
-        raise ValueError(
-            "candidates must be a dictionary of measurements or functions by name, as "
-            f"{{'twice as long': longer}}, got {candidates!r:.60}"
-        )
-    found = []
-    for name, planned in candidates.items():
-        is_fixed = isinstance(planned, Measurement | dict)
-        change = partial(_instead, planned) if is_fixed else planned
-        found.append(Candidate(str(name), "", change, f"yours: {name}"))
-    return found
-
-
-def _instead(planned: Planned, measurement: Measurement) -> Planned:
-    return planned
-
-
-def _unchanged(measurement: Measurement) -> Measurement:
-    return measurement
-
-
-def _of_this_material(
-    measurements: dict[str, Measurement], base: Measurement, names: tuple[str, ...]
-) -> dict[str, Measurement]:
-    """Return measurements with the values that their material has in the present experiment."""
-    varied = (*names, *base.priors)
-    of_material = tuple(
-        x for x in varied if x not in PARAMETERS or PARAMETERS[x].belongs_to == MATERIAL
-    )
-    return {
-        label: replace(m, gas=with_values_of(m.gas, base.gas, of_material))
-        for label, m in measurements.items()
-    }
-
-
-def _fit(name: str, measurements: dict[str, Measurement], free: Any, quick: bool = False) -> Fit:
-    """Fit measurements without warnings; errors begin with their name.
-
-    Several curves share the parameters of the material; each has its own parameters of the scene.
-    """
-    curves = [m for m in measurements.values() if isinstance(m.data, CoolingCurve)]
-    separate = ()
-    if len(curves) > 1:
-        separate = tuple(x for x in free if x in PARAMETERS and PARAMETERS[x].belongs_to == SCENE)
-        free = tuple(x for x in free if x not in separate)
-    given = measurements[""] if [*measurements] == [""] else measurements
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            return fit(given, free=free, separate=separate, quick=quick)
-    except (ValueError, RuntimeError) as error:
-        raise type(error)(f"{name}: {error}") from None
-
-
-def _relative(result: Fit, name: str, truth: Truth, gas: Gas) -> tuple[float, float]:
-    """Return the range of a parameter over its true value; 0 to inf if there is none.
-
-    If each of several curves has the parameter for itself, that of the first curve counts.
-    """
-    titles = [title for title in result.ranges if title.rpartition(": ")[2] == name]
-    if not titles:
-        return 0.0, float("inf")
-    low, high = (float(np.ravel(x)[0]) for x in result.ranges[titles[0]])
-    true = float(np.ravel(truth.gas(gas).value(name))[0])
-    return low / true, high / true
-
-
-def _at_its_fit(measurement: Measurement, free: Any) -> Measurement:
-    """Return a measurement with the values of its fit.
-
-    Its errors remain, relative to these; those that the fit found are added.
-    """
-    found = _fit(DATA, {"": measurement}, free, quick=True)
-    fields = {}
-    for name in ("temperature", "rotational_temperature", "displacement"):
-        fitted = getattr(found.curve, name)
-        if getattr(measurement.curve, name) is not None and fitted is not None:
-            fields[name] = np.asarray(fitted)
-    if found.errors_of_T:
-        fields["temperature_error"] = found.errors_of_T[""] * fields["temperature"]
-    base = replace(measurement, gas=found.gas, rounding={}, header=())
-    return twin(with_curve(base, **fields))
 
 
 def _check(measurement: Any) -> None:
@@ -420,6 +244,217 @@ def _check(measurement: Any) -> None:
         )
 
 
+def _candidates_of_user(given: Any) -> list[Candidate]:
+    """Return the candidates of a user, or raise ValueError."""
+    is_dictionary = isinstance(given, dict) and bool(given)
+    if not is_dictionary or not all(
+        callable(x) or isinstance(x, Measurement | dict) for x in given.values()
+    ):
+        raise ValueError(
+            "candidates must be a dictionary of measurements or functions by name, as "
+            f"{{'twice as long': longer}}, got {given!r:.60}"
+        )
+    return [_candidate_of_user(str(name), planned) for name, planned in given.items()]
+
+
+def _candidate_of_user(name: str, planned: Any) -> Candidate:
+    kind = f"yours: {name}"
+    if isinstance(planned, Measurement | dict):
+        return Candidate(name, "", lambda measurement: planned, kind, is_fixed=True)
+    return Candidate(name, "", planned, kind)
+
+
+def _at_its_fit(measurement: Measurement, free: Any) -> Measurement:
+    """Return a measurement with the values of its fit.
+
+    Its errors remain, relative to these; those that the fit found are added.
+    """
+    found = _fit(DATA, measurement, free=free, quick=True)
+    fields = {}
+    for quantity in WITH_ERRORS:
+        measured = getattr(measurement.curve, quantity.field)
+        fitted = getattr(found.curve, quantity.field)
+        if measured is not None and fitted is not None:
+            fields[quantity.field] = np.asarray(fitted)
+    if found.errors_of_T:
+        fields["temperature_error"] = found.errors_of_T[""] * fields["temperature"]
+    base = replace(measurement, gas=found.gas, rounding={}, header=())
+    return twin(with_curve(base, **fields))
+
+
+class _Range(NamedTuple):
+    """The 95 % range of a parameter over its true value."""
+
+    low: float
+    high: float
+
+    @property
+    def width(self) -> float:
+        """Its width, `OPEN_WIDTH` at most."""
+        return min(self.high - self.low, OPEN_WIDTH)
+
+
+@dataclass
+class _Experiment:
+    """An experiment, and the ranges of its first free parameter for some truths.
+
+    Attributes:
+        candidate: the addition.
+        measurements: by label.
+        free: names of the free parameters.
+        ranges: by name of the truth.
+    """
+
+    candidate: Candidate
+    measurements: dict[str, Measurement]
+    free: tuple[str, ...]
+    ranges: dict[str, _Range] = field(default_factory=dict)
+
+    def add_range(self, truth: Truth) -> None:
+        """Compute the range for a truth, unless it is known, or the effect is known to be absent.
+
+        Several curves share the parameters of the material; each has its own ones of the scene.
+        """
+        measurements = self.measurements
+        is_absent = any(truth.effect in m.absent for m in measurements.values())
+        if truth.name in self.ranges or is_absent:
+            return
+        curves = [m for m in measurements.values() if isinstance(m.data, CoolingCurve)]
+        separate = ()
+        if len(curves) > 1:
+            separate = tuple(x for x in self.free if _belongs_to(x) == SCENE)
+        shared = tuple(x for x in self.free if x not in separate)
+        twins = {label: twin(m, truth) for label, m in measurements.items()}
+        planned = twins[""] if [*twins] == [""] else twins
+        name = f"candidate {self.candidate.name!r}"
+        result = _fit(name, planned, free=shared, separate=separate)
+        first = next(iter(measurements.values()))
+        self.ranges[truth.name] = _range_over_truth(result, self.free[0], truth.gas(first.gas))
+
+    def gain_over(self, present: "_Experiment") -> float:
+        """Return the width without the addition over that with it, the median over truths."""
+        gains = [
+            present.ranges[truth].width / max(known.width, 1e-300)
+            for truth, known in self.ranges.items()
+        ]
+        return float(np.median(gains))
+
+    def expected(self, present: "_Experiment") -> Expected:
+        """Return the range to expect, in SI units, beside the experiment as it is."""
+        given = self.ranges[AS_GIVEN.name]
+        widths = [known.width for known in self.ranges.values()]
+        (base,) = present.measurements.values()
+        true_value = _number(base.gas, self.free[0])
+        return Expected(
+            name=self.candidate.name,
+            price=self.candidate.price,
+            low=given.low * true_value,
+            high=given.high * true_value,
+            width=given.width,
+            median=float(np.median(widths)),
+            smallest=min(widths),
+            largest=max(widths),
+            gain=self.gain_over(present),
+        )
+
+
+def _with_additions(present: _Experiment, candidates: Sequence[Candidate]) -> list[_Experiment]:
+    """Return an experiment with each addition that applies, for the given values, the best first.
+
+    A material has the same values in all of them.
+    """
+    (base,) = present.measurements.values()
+    of_material = tuple(
+        name for name in (*present.free, *base.priors) if _belongs_to(name) in (MATERIAL, None)
+    )
+    experiments = []
+    for candidate in candidates:
+        changed = candidate.change(base)
+        if changed is None:
+            continue
+        measurements = {
+            label: replace(m, gas=with_values_of(m.gas, base.gas, of_material))
+            for label, m in _by_label(candidate, changed).items()
+        }
+        experiment = _Experiment(candidate, measurements, present.free)
+        experiment.add_range(AS_GIVEN)
+        experiments.append(experiment)
+    return sorted(experiments, key=lambda x: -x.gain_over(present))
+
+
+def _by_label(candidate: Candidate, changed: Any) -> dict[str, Measurement]:
+    """Return what a candidate gave by label, or raise ValueError."""
+    if isinstance(changed, Measurement):
+        return {"": changed}
+    if not isinstance(changed, dict):
+        raise ValueError(
+            f"candidate {candidate.name!r} must give a jaxgran.Measurement, several by label "
+            f"or None, got a {type(changed).__name__}"
+        )
+    return changed
+
+
+def _best_of_each_kind(experiments: list[_Experiment]) -> list[_Experiment]:
+    """Return the best experiments, with additions of different kinds."""
+    best: dict[str, _Experiment] = {}
+    for experiment in experiments:
+        best.setdefault(experiment.candidate.kind, experiment)
+    return list(best.values())[:NUM_BEST]
+
+
+def _pairs(experiments: list[_Experiment]) -> list[Candidate]:
+    """Return the combinations of two of their additions."""
+    parts = [x.candidate for x in experiments if not x.candidate.is_fixed]
+    return [
+        Candidate(f"{a.name} + {b.name}", "both", partial(combined, a.change, b.change), "pair")
+        for a, b in combinations(parts, 2)
+    ]
+
+
+def _belongs_to(name: str) -> str | None:
+    """Return what a parameter is of, as `MATERIAL`; None for one that is not of a gas."""
+    return PARAMETERS[name].belongs_to if name in PARAMETERS else None
+
+
+def _fit(name: str, measurement: Planned, **options: Any) -> Fit:
+    """Fit measurements without warnings; errors begin with their name."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            return fit(measurement, **options)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
+    except RuntimeError as error:
+        raise RuntimeError(f"{name}: {error}") from None
+
+
+def _range_over_truth(result: Fit, name: str, truth: Gas) -> _Range:
+    """Return the range of a parameter over its true value; 0 to inf if there is none.
+
+    If each of several curves has the parameter for itself, that of the first curve counts.
+    """
+    for title, (low, high) in result.ranges.items():
+        if title.rpartition(": ")[2] == name:
+            true_value = _number(truth, name)
+            return _Range(
+                low=float(np.ravel(low)[0]) / true_value,
+                high=float(np.ravel(high)[0]) / true_value,
+            )
+    return _Range(0.0, float("inf"))
+
+
+def _number(gas: Gas, name: str) -> float:
+    """Return the value of a parameter, of a vector its first element."""
+    return float(np.ravel(gas.value(name))[0])
+
+
+def _range_in_words(x: Expected, unit: str) -> str:
+    """Say between which ends the parameter is expected."""
+    if not x.width < OPEN_WIDTH:
+        return f"above {x.low:.3g} {unit}".strip()
+    return f"between {x.low:.3g} and {x.high:.3g} {unit}".strip()
+
+
 def _ends(x: Expected) -> str:
     """Return the range in a cell of a table."""
     high = f"{x.high:.3g}" if x.width < OPEN_WIDTH else "no end"
@@ -437,10 +472,3 @@ def _percent(x: float) -> str:
     if not x < OPEN_WIDTH:
         return "open"
     return f"{100 * x:.2g}" if x < 1 else f"{100 * x:.0f}"
-
-
-def _range(x: Expected, unit: str) -> str:
-    """Say between which ends the parameter is expected."""
-    if not x.width < OPEN_WIDTH:
-        return f"above {x.low:.3g} {unit}".strip()
-    return f"between {x.low:.3g} and {x.high:.3g} {unit}".strip()

@@ -345,10 +345,9 @@ def _explanations(
     offset = np.where(rows.used > 0, model_values.reshape(2, -1).T - compared, 0.0)
     moved = replace(rows, offset=offset)
     problem = problem_with_rate_errors(replace(problem, measurements=(moved,)), start)
-    is_driven = rows.scene.drive is not None
     errors = np.sqrt(np.diag(noise))
     minimum = Minimum(start, 0.0, 0, True)
-    return compare_alternatives(problem, [minimum], errors, is_driven)
+    return compare_alternatives(problem, [minimum], errors)
 
 
 def derivative_bias(sims: Simulations, search: Search, gas: Gas, sensitivity: np.ndarray) -> float:

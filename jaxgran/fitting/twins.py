@@ -1,22 +1,23 @@
 """Twins of an experiment: the values that it would measure if kinetic theory and a truth hold."""
 
-import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxgran._utils.tracing import as_jax_arrays
+from jaxgran.data.curve import WITH_ERRORS, CoolingCurve
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import START_TIME, Measurement
 from jaxgran.fitting.alternatives import Alternative
 from jaxgran.fitting.kinds import (
     DRAG_ADDED,
+    KINDS,
     ROUGHNESS_ADDED,
-    WALL_RESTITUTION,
     WALLS_ADDED,
+    FittedCurve,
     initial_rate,
-    side_of_walls,
 )
 from jaxgran.fitting.measured_rows import finite_size_cooling_factor
 from jaxgran.fitting.parameters import as_floats, with_parameters
@@ -36,6 +37,15 @@ RATE_TIMES = np.geomspace(1e-2, 1e4, 100)
 
 NUM_EFFECTS = 2
 """Number of truths that contain an effect of which the fit is not informed."""
+
+ADDED_ELEMENTS: dict[str, Callable[[dict[str, float]], dict[str, Any]]] = {
+    WALLS_ADDED: lambda values: {
+        "container": Walls(values["wall_side"], restitution=values["wall_coefficient"])
+    },
+    DRAG_ADDED: lambda values: {"drag": StokesDrag(values["drag_rate"])},
+    ROUGHNESS_ADDED: lambda values: {"surface": Rough(values["tangential_restitution"])},
+}
+"""Element of a gas, by field, from the values of the kind of alternatives that adds it."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +79,18 @@ class Truth:
 AS_GIVEN = Truth("as given")
 
 
+class StrongestEffect(NamedTuple):
+    """The effect that the data prefer, or that widens the range of a fit most.
+
+    Attributes:
+        truth: the gas with this effect.
+        values: of the free parameters beside it, by name; {} if they are those of the fit.
+    """
+
+    truth: Truth
+    values: dict[str, np.ndarray]
+
+
 def truths_of(measurement: Measurement, result: Fit) -> list[Truth]:
     """Return gases that may be the real one, the given one first.
 
@@ -81,51 +103,55 @@ def truths_of(measurement: Measurement, result: Fit) -> list[Truth]:
         result: its fit.
     """
     gas = measurement.gas
-    rng = np.random.default_rng(0)
-    known = {}
-    for name, (value, error) in measurement.priors.items():
-        if name in gas.domains:
-            width = np.asarray(error) / gas.domains[name].slope(np.asarray(value))
-            known[name] = float(np.max(width)) * rng.standard_normal()
     first = result.names[0]
+    departures = _random_departures(measurement)
     truths = [AS_GIVEN]
     for sign, words in ((-1, "smaller"), (1, "larger")):
-        shifts = {name: sign * shift for name, shift in known.items()}
-        shifts |= {first: sign * PARAMETER_SHIFT} if first in gas.domains else {}
+        shifts = {name: sign * shift for name, shift in departures.items()}
+        if first in gas.domains:
+            shifts[first] = sign * PARAMETER_SHIFT
         truths.append(Truth(f"{words} {symbol_of(first)}", shifts))
-    rate = _cooling_rate(gas)
-    effects = [_with_effect(x, x.allowed[1] / 2, gas, rate) for x in _widening(result)]
+    curve = _computed_curve(gas)
+    effects = [_with_effect(x, x.allowed[1] / 2, curve) for x in _widening(result)]
     return truths + [truth for truth in effects if truth is not None][:NUM_EFFECTS]
 
 
-def strongest_effect(result: Fit) -> tuple[Truth, dict[str, np.ndarray]] | None:
-    """Return a gas with the effect that the data prefer, or that widens the range most.
+def _random_departures(measurement: Measurement) -> dict[str, float]:
+    """Return one random error of each parameter with a prior, in its unconstrained scale."""
+    domains = measurement.gas.domains
+    rng = np.random.default_rng(0)
+    departures = {}
+    for name, (value, error) in measurement.priors.items():
+        if name in domains:
+            width = np.asarray(error) / domains[name].slope(np.asarray(value))
+            departures[name] = float(np.max(width)) * rng.standard_normal()
+    return departures
+
+
+def strongest_effect(result: Fit) -> StrongestEffect | None:
+    """Return the effect that the data prefer, or that widens the range most; None without one.
 
     Args:
         result: a fit of one curve.
-
-    Returns:
-        The truth, and values of the free parameters with it; None without such an effect.
     """
-    gas = result.gas
-    rate = _cooling_rate(gas)
+    curve = _computed_curve(result.gas)
     for alternative in result.alternatives:
-        truth = _with_effect(alternative, alternative.amplitude, gas, rate)
+        truth = _with_effect(alternative, alternative.amplitude, curve)
         if alternative.preferred and truth is not None:
-            return truth, _values_by_name(result, alternative.estimate)
+            return StrongestEffect(truth, _values_by_name(result, alternative.estimate))
     for alternative in _widening(result):
-        truth = _with_effect(alternative, alternative.allowed[1] / 2, gas, rate)
+        truth = _with_effect(alternative, alternative.allowed[1] / 2, curve)
         if truth is not None:
-            return truth, {}
+            return StrongestEffect(truth, {})
     return None
 
 
-def _cooling_rate(gas: Gas) -> float:
-    """Return the cooling rate of a gas at the start, 1/s, as amplitudes of alternatives mean it."""
+def _computed_curve(gas: Gas) -> FittedCurve:
+    """Return what the amplitudes of alternatives to the curve of a gas are measured by."""
     times = np.append(0.0, RATE_TIMES * float(gas.mean_free_time))
     curve = curve_of_program(KineticTheory().simplified_for(gas), gas, times)
     T = np.asarray(curve.temperature)
-    return initial_rate(times, np.log(T / T[0]))
+    return FittedCurve(gas, initial_rate(times, np.log(T / T[0])), float(T[-1]))
 
 
 def _values_by_name(result: Fit, estimate: np.ndarray) -> dict[str, np.ndarray]:
@@ -144,26 +170,15 @@ def _widening(result: Fit) -> list[Alternative]:
     return sorted(found, key=lambda alternative: -alternative.error_reduction_needed)
 
 
-def _with_effect(alternative: Alternative, amplitude: float, gas: Gas, rate: float) -> Truth | None:
-    """Return a truth with an effect; None for effects of several parameters.
-
-    Args:
-        alternative: the effect.
-        amplitude: its size.
-        gas: the scene.
-        rate: its cooling rate at the start, 1/s.
-    """
-    elements: dict[str, Any] = {}
-    if alternative.name == WALLS_ADDED:
-        side = side_of_walls(gas, amplitude * rate)
-        elements["container"] = Walls(side, restitution=WALL_RESTITUTION)
-    elif alternative.name == DRAG_ADDED:
-        elements["drag"] = StokesDrag(amplitude * rate / 2)
-    elif alternative.name == ROUGHNESS_ADDED:
-        elements["surface"] = Rough(amplitude - 1)
-    if not elements or amplitude == 0:
+def _with_effect(alternative: Alternative, amplitude: float, curve: FittedCurve) -> Truth | None:
+    """Return a truth with an effect; None for one of amplitude 0, or not in `ADDED_ELEMENTS`."""
+    if alternative.name not in ADDED_ELEMENTS:
         return None
-    return Truth(f"with {alternative.effect}", {}, alternative.effect, elements)
+    kind = next(kind for kind in KINDS if kind.name == alternative.name)
+    elements = ADDED_ELEMENTS[kind.name](kind.values(amplitude, curve))
+    if amplitude == 0:
+        return None
+    return Truth(f"with {alternative.effect}", effect=alternative.effect, elements=elements)
 
 
 def twin(measurement: Measurement, truth: Truth = AS_GIVEN) -> Measurement:
@@ -178,31 +193,40 @@ def twin(measurement: Measurement, truth: Truth = AS_GIVEN) -> Measurement:
     gas = truth.gas(measurement.gas)
     data = measurement.data
     if isinstance(data, DropTest):
-        values = {"restitution": data.computed(gas)}
-        if data.is_oblique:
-            values["tangential_restitution"] = data.computed_tangential(gas)
-        return replace(measurement, data=replace(data, **values))
+        return replace(measurement, data=_twin_of_impacts(data, gas))
+    return replace(measurement, data=_twin_of_curve(measurement, gas), of_energy=False)
+
+
+def _twin_of_impacts(drops: DropTest, gas: Gas) -> DropTest:
+    values = {"restitution": drops.computed(gas)}
+    if drops.is_oblique:
+        values["tangential_restitution"] = drops.computed_tangential(gas)
+    return replace(drops, **values)
+
+
+def _twin_of_curve(measurement: Measurement, gas: Gas) -> CoolingCurve:
+    """Return the measured quantities of a curve as a gas has them, with their relative errors."""
+    measured = measurement.curve
     N = measurement.num_particles
     faster = 1.0 if N is None else float(finite_size_cooling_factor(measurement.gas, float(N)))
     t0 = float(measurement.priors.get(START_TIME, (0.0, 0.0))[0])
-    elapsed = np.maximum(np.asarray(data.times) - t0, 0.0) * faster
+    elapsed = np.maximum(np.asarray(measured.times) - t0, 0.0) * faster
     times, place = times_with_nodes(elapsed, float(gas.mean_free_time))
     model = KineticTheory()
-    # The program of the fit, whose alternatives have Gaussian spins where its spheres are smooth.
-    of_fit = model.simplified_for(measurement.gas)
-    curve = curve_of_program(of_fit, gas, times)
-    if data.displacement is not None:
-        curve = model.simulate(gas, as_jax_arrays(times))
-    fields: dict[str, Any] = {}
-    for name in ("temperature", "rotational_temperature", "displacement"):
-        given = getattr(data, name)
-        error = getattr(data, f"{name}_error")
+    if measured.displacement is None:
+        # As in the fit, whose alternatives have Gaussian spins where its spheres are smooth.
+        computed = curve_of_program(model.simplified_for(measurement.gas), gas, times)
+    else:
+        computed = model.simulate(gas, as_jax_arrays(times))
+    fields: dict[str, Any] = {"times": np.asarray(measured.times)}
+    for quantity in WITH_ERRORS:
+        given = getattr(measured, quantity.field)
         if given is None:
             continue
-        fields[name] = np.asarray(getattr(curve, name))[place]
+        values = np.asarray(getattr(computed, quantity.field))[place]
+        fields[quantity.field] = values
+        error = getattr(measured, quantity.error.field)
         if error is not None:
-            scale = np.where(given > 0, fields[name] / np.where(given > 0, given, 1.0), 1.0)
-            fields[f"{name}_error"] = np.asarray(error) * scale
-    known = as_jax_arrays({"times": np.asarray(data.times)} | fields)
-    data = dataclasses.replace(data, **known)
-    return replace(measurement, data=data, of_energy=False)
+            ratio = np.where(given > 0, values / np.where(given > 0, given, 1.0), 1.0)
+            fields[quantity.error.field] = np.asarray(error) * ratio
+    return replace(measured, **as_jax_arrays(fields))
