@@ -314,6 +314,10 @@ ELEMENTS = {
 """A check of each element, and one that models without it refuse."""
 
 
+SPHERES = "hard spheres", "soft spheres"
+"""Cases whose programs take longest to compile."""
+
+
 def of_models(which=lambda case: True, slow=()):
     """Parametrise a test over the models that `which` selects, of which some are slow.
 
@@ -337,7 +341,7 @@ def has_positions(case):
 
 
 class TestContract:
-    @of_models()
+    @of_models(slow=SPHERES)
     def test_the_start_is_that_of_the_gas(self, case):
         curve = case.base
         assert not curve.status
@@ -407,7 +411,7 @@ class TestContract:
         np.testing.assert_array_equal(again.replicas.temperature, each)
         assert not np.any(np.isin(other.replicas.temperature[:, -1], each[:, -1]))
 
-    @of_models()
+    @of_models(slow=SPHERES)
     def test_units_do_not_matter(self, case):
         gas, start = case.gas, case.start
         names = PARAMETER_UNITS.keys() & gas.domains.keys()
@@ -442,7 +446,7 @@ class TestContract:
             moved = moved - drift[None] * found[0].times[:, None, None, None]
             np.testing.assert_allclose(moved, side * np.round(moved / side), atol=1e-9 * side)
 
-    @of_models(slow=("soft spheres", "DSMC"))
+    @of_models(slow=(*SPHERES, "DSMC"))
     def test_vmap_and_jit_are_a_loop(self, case):
         """In one program without calls to the host; a member out of range alone is nan."""
         model, times = case.model, case.times
@@ -482,7 +486,7 @@ class TestContract:
         program = jax.jit(lambda x: jax.pure_callback(np.sin, x, x)).lower(1.0)
         assert HOST.search(program.as_text()) is not None
 
-    @of_models(lambda case: not isinstance(case.model, jaxgran.KineticTheory))  # see test_solver
+    @of_models(is_stochastic, slow=SPHERES)  # of kinetic theory: test_solver
     def test_reverse_is_forward(self, case):
         weights = jnp.arange(1.0, 5.0)
 
@@ -587,7 +591,7 @@ class TestContract:
         assert int(curve.status) != 0 and np.all(np.isnan(curve.temperature))
 
     @pytest.mark.parametrize("element", ELEMENTS)
-    @of_models()
+    @of_models(slow=SPHERES)
     def test_element_keeps_the_ledger_or_is_refused(self, case, element):
         assert (element in case.model.elements) == (element in case.elements)
         check, refused = ELEMENTS[element]

@@ -8,10 +8,8 @@ import pytest
 from experiments.accuracy import size_statistics as runs
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(x, marks=[pytest.mark.slow] if x == "within 10 %" else []) for x in runs.SIZES],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", runs.SIZES)
 def test_stored_runs_cool_and_scatter_as_theory_says(name):
     stored = np.load(runs.STORED)
     fields = "times", "runs", "mean", "covariance"

@@ -31,13 +31,8 @@ CASES = {
 """Model, gas, parameter, and whether members share an array."""
 
 
-OFTEN = ("list of numbers, hard",)
-
-
-@pytest.mark.parametrize(
-    "case",
-    [case if case in OFTEN else pytest.param(case, marks=pytest.mark.slow) for case in CASES],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
 def test_members_are_the_gases_that_they_are_alone(case, monkeypatch):
     model, gas, name, shared = CASES[case]
     gas_at = scaled(gas, name)

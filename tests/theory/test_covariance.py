@@ -34,6 +34,7 @@ GASES = {
     "driven": replace(glass_beads(), drive=jaxgran.WhiteNoise(0.05)),
     "all": replace(glass_beads(), surface=SLIDING, container=WALLS, drag=DRAG),
 }
+LONG = {"rough": pytest.mark.slow, "from rest": pytest.mark.slow, "all": pytest.mark.minutes}
 
 
 def taus(gas, *values):
@@ -185,7 +186,7 @@ def test_walls_take_regularly():
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(x, marks=pytest.mark.minutes) if x == "all" else x for x in GASES]
+    "name", [pytest.param(name, marks=LONG.get(name, ())) for name in GASES]
 )
 def test_is_positive_symmetric_and_zero_at_the_start(name):
     gas = GASES[name]

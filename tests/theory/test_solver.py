@@ -34,7 +34,8 @@ def logs(gas, times):
     return jnp.log(jnp.stack([values for values in each if values is not None]))
 
 
-@pytest.mark.parametrize("name", ["series", pytest.param("all elements", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["series", "all elements"])
 def test_all_routes_agree(name):
     gas = GASES[name]
     times = TAUS * gas.mean_free_time
