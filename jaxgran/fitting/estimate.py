@@ -176,9 +176,9 @@ def check_computed(problem: Problem, end: Minimum) -> None:
     for curve in problem.evaluate(end.flat).curves.values():
         fault = int(curve.get("status", status.OK))
         if fault != status.OK:
-            names = [u.title for u in problem.unknowns]
-            values = zip(names, problem.estimates(end.flat), strict=False)
-            at = ", ".join(f"{name} = {value:.3g}" for name, value in values)
+            values = [np.asarray(value) for _, value in problem.parts(end.flat)]
+            free = zip(titles(problem), values, strict=False)
+            at = ", ".join(f"{name} = {np.array2string(x, precision=3)}" for name, x in free)
             raise RuntimeError(
                 f"{type(problem.model).__name__} could not compute the curve at {at}, where the "
                 f"search ended: {status.explain(fault)}"

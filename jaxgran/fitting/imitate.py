@@ -1,6 +1,5 @@
 """Imitations of a measurement: runs of the fitted scene by particles, each of them fitted."""
 
-import warnings
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -19,7 +18,8 @@ from jaxgran.fitting.drawn_errors import imitations
 from jaxgran.fitting.fit import fit
 from jaxgran.fitting.measured_rows import with_errors_that_count
 from jaxgran.fitting.result import CONDITIONAL, Fit
-from jaxgran.fitting.twins import AS_GIVEN, Truth, strongest_effect
+from jaxgran.fitting.threads import quiet_threads
+from jaxgran.fitting.twins import AS_GIVEN, Truth, magnitude_of, strongest_effect
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_key
 from jaxgran.models.choose import choose_model
@@ -95,7 +95,7 @@ class Imitation:
     def width(self) -> float:
         """Median width of the range, over the true value."""
         known = np.isfinite(self.low)
-        widths = (self.high - self.low)[known] / self.value
+        widths = (self.high - self.low)[known] / magnitude_of(self.value)
         return float(np.median(widths)) if np.any(known) else float("nan")
 
     @property
@@ -231,11 +231,11 @@ def _imitated(
 ) -> Imitation:
     """Return fits of runs of a truth, with the measurement at its values."""
     gas = truth.gas(measurement.gas)
+    since_start = _times_since_start(measurement, result)
     if model is None:
-        model = _particle_model(truth, gas, measurement)
+        model = _particle_model(truth, gas, since_start, measurement.num_particles)
     of_start, of_errors = jax.random.split(key)
     several: Any = replace(model, replicas=runs * measurement.replicas)  # of particles
-    since_start = _times_since_start(measurement, result)
     curve = cool(gas, since_start, model=several, key=of_start, progress=progress)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(of_errors)))
     twins = imitations(measurement, result, curve, runs, rng)
@@ -257,14 +257,15 @@ def _imitated(
     )
 
 
-def _particle_model(truth: Truth, gas: Gas, measurement: Measurement) -> AbstractModel:
+def _particle_model(
+    truth: Truth, gas: Gas, times: Float[Array, "times"], N: int | None
+) -> AbstractModel:
     """Return the model of N particles that imitates a gas."""
-    N = measurement.num_particles
     assert N is not None
     if "container" in truth.elements:  # these walls do not enclose N grains
         return DSMC(N)
     models = (DSMC(N, replicas=MANY_RUNS), HardSpheres(N, replicas=MANY_RUNS))
-    return choose_model(gas, measurement.curve.times, TOLERANCE, N, models=models).model
+    return choose_model(gas, times, TOLERANCE, N, models=models).model
 
 
 def _times_since_start(measurement: Measurement, result: Fit) -> Float[Array, "times"]:
@@ -290,12 +291,12 @@ def _fits(
 ) -> list[Fit]:
     """Return the fits of imitations, those before an interruption; without any it is raised."""
     fits: list[Fit] = []
-    bar = tqdm(measurements, desc="fits", delay=3, disable=None if progress else True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
+    hidden = None if progress else True  # None hides the bar where there is no terminal
+    with quiet_threads() as threads:
+        found = threads.map(lambda one: fit(one, model=theory, free=free), measurements)
         try:
-            for measurement in bar:
-                fits.append(fit(measurement, model=theory, free=free))
+            for result in tqdm(found, "fits", len(measurements), delay=3, disable=hidden):
+                fits.append(result)
         except KeyboardInterrupt:
             if not fits:
                 raise

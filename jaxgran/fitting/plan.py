@@ -1,6 +1,5 @@
 """The plan of an experiment: the range of a parameter to expect, and which addition narrows it."""
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -24,7 +23,8 @@ from jaxgran.fitting.fit import HOW_TO_MEASURE, fit
 from jaxgran.fitting.measured_rows import with_errors_that_count
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.setup import with_values_of
-from jaxgran.fitting.twins import AS_GIVEN, Truth, truths_of, twin
+from jaxgran.fitting.threads import quiet_threads
+from jaxgran.fitting.twins import AS_GIVEN, Truth, magnitude_of, truths_of, twin
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.parameters import MATERIAL, PARAMETERS, SCENE, symbol_of, unit_of
 
@@ -193,8 +193,9 @@ def plan(
     measurement = with_errors_that_count(measurement)
     listed = None if candidates is None else _candidates_of_user(candidates)
     is_planned = measurement.curve.status is not None
-    base = twin(measurement) if is_planned else _at_its_fit(measurement, free)
-    central = _fit(DATA, base, free=free)
+    with quiet_threads():
+        base = twin(measurement) if is_planned else _at_its_fit(measurement, free)
+        central = _fit(DATA, base, free=free)
     parameter = central.names[0]
     if parameter not in base.gas.domains:
         raise ValueError(f"a plan needs a parameter of the gas first in free, got {central.names}")
@@ -204,9 +205,7 @@ def plan(
     listed = standard_candidates(base) if listed is None else listed
     experiments = _with_additions(present, listed)
     best = _best_of_each_kind(experiments)
-    for experiment in (present, *best):
-        for truth in truths:
-            experiment.add_range(truth)
+    _add_ranges([present, *best], truths)
     pairs = _with_additions(present, _pairs(best))
     # Those that were compared for all truths come first.
     experiments.sort(key=lambda x: (len(x.ranges) == 1, -x.gain_over(present)))
@@ -283,7 +282,7 @@ def _at_its_fit(measurement: Measurement, free: Any) -> Measurement:
 
 
 class _Range(NamedTuple):
-    """The 95 % range of a parameter over its true value."""
+    """The 95 % range of a parameter over the magnitude of its true value."""
 
     low: float
     high: float
@@ -344,12 +343,12 @@ class _Experiment:
         given = self.ranges[AS_GIVEN.name]
         widths = [known.width for known in self.ranges.values()]
         (base,) = present.measurements.values()
-        true_value = _number(base.gas, self.free[0])
+        magnitude = magnitude_of(_number(base.gas, self.free[0]))
         return Expected(
             name=self.candidate.name,
             price=self.candidate.price,
-            low=given.low * true_value,
-            high=given.high * true_value,
+            low=given.low * magnitude,
+            high=given.high * magnitude,
             width=given.width,
             median=float(np.median(widths)),
             smallest=min(widths),
@@ -376,10 +375,21 @@ def _with_additions(present: _Experiment, candidates: Sequence[Candidate]) -> li
             label: replace(m, gas=with_values_of(m.gas, base.gas, of_material))
             for label, m in _by_label(candidate, changed).items()
         }
-        experiment = _Experiment(candidate, measurements, present.free)
-        experiment.add_range(AS_GIVEN)
-        experiments.append(experiment)
+        experiments.append(_Experiment(candidate, measurements, present.free))
+    _add_ranges(experiments, [AS_GIVEN])
     return sorted(experiments, key=lambda x: -x.gain_over(present))
+
+
+def _add_ranges(experiments: list[_Experiment], truths: list[Truth]) -> None:
+    """Compute the range of each experiment for each truth."""
+    with quiet_threads() as threads:
+        tasks = [
+            threads.submit(experiment.add_range, truth)
+            for experiment in experiments
+            for truth in truths
+        ]
+        for task in tasks:
+            task.result()
 
 
 def _by_label(candidate: Candidate, changed: Any) -> dict[str, Measurement]:
@@ -417,11 +427,9 @@ def _belongs_to(name: str) -> str | None:
 
 
 def _fit(name: str, measurement: Planned, **options: Any) -> Fit:
-    """Fit measurements without warnings; errors begin with their name."""
+    """Fit measurements; errors begin with their name."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            return fit(measurement, **options)
+        return fit(measurement, **options)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
     except RuntimeError as error:
@@ -429,16 +437,16 @@ def _fit(name: str, measurement: Planned, **options: Any) -> Fit:
 
 
 def _range_over_truth(result: Fit, name: str, truth: Gas) -> _Range:
-    """Return the range of a parameter over its true value; 0 to inf if there is none.
+    """Return the range of a parameter over its magnitude; 0 to inf if there is none.
 
     If each of several curves has the parameter for itself, that of the first curve counts.
     """
     for title, (low, high) in result.ranges.items():
         if title.rpartition(": ")[2] == name:
-            true_value = _number(truth, name)
+            magnitude = magnitude_of(_number(truth, name))
             return _Range(
-                low=float(np.ravel(low)[0]) / true_value,
-                high=float(np.ravel(high)[0]) / true_value,
+                low=float(np.ravel(low)[0]) / magnitude,
+                high=float(np.ravel(high)[0]) / magnitude,
             )
     return _Range(0.0, float("inf"))
 

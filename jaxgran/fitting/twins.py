@@ -91,6 +91,11 @@ class StrongestEffect(NamedTuple):
     values: dict[str, np.ndarray]
 
 
+def magnitude_of(true_value: float) -> float:
+    """Return what widths of ranges are compared with; 1 for a true value of 0, as of beta_t."""
+    return abs(true_value) or 1.0
+
+
 def truths_of(measurement: Measurement, result: Fit) -> list[Truth]:
     """Return gases that may be the real one, the given one first.
 
@@ -172,12 +177,10 @@ def _widening(result: Fit) -> list[Alternative]:
 
 def _with_effect(alternative: Alternative, amplitude: float, curve: FittedCurve) -> Truth | None:
     """Return a truth with an effect; None for one of amplitude 0, or not in `ADDED_ELEMENTS`."""
-    if alternative.name not in ADDED_ELEMENTS:
+    if alternative.name not in ADDED_ELEMENTS or amplitude == 0:
         return None
     kind = next(kind for kind in KINDS if kind.name == alternative.name)
     elements = ADDED_ELEMENTS[kind.name](kind.values(amplitude, curve))
-    if amplitude == 0:
-        return None
     return Truth(f"with {alternative.effect}", effect=alternative.effect, elements=elements)
 
 

@@ -1,12 +1,13 @@
 """Plans of experiments: twins, truths, additions, and the range to expect."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.fitting import candidates
+from jaxgran.fitting import candidates, twins
 from jaxgran.fitting.kinds import initial_rate
 from jaxgran.fitting.measured_rows import with_errors_that_count
 from jaxgran.fitting.plan import _at_its_fit
@@ -223,3 +224,20 @@ def test_refused_candidates_are_named():
         jaxgran.plan(SMOOTH, free=("gamma",))
     with pytest.raises(ValueError, match="'mine' must give a jaxgran.Measurement"):
         jaxgran.plan(SMOOTH, candidates={"mine": lambda m: 3})
+
+
+@pytest.mark.slow
+def test_the_width_of_a_negative_parameter_is_positive():
+    known = dataclasses.replace(ROUGH, absent=("walls", "drag"))
+    found = jaxgran.plan(known, free=("beta_t",), candidates={"the same": lambda m: m})
+    assert found.truth == pytest.approx(-0.3, rel=1e-2)
+    assert found.present.low < found.truth < found.present.high
+    assert found.present.width > 0
+    assert found.additions[0].gain == pytest.approx(1.0)
+
+
+def test_an_effect_of_amplitude_0_is_no_truth(monkeypatch):
+    """Its walls would be infinitely far away in single precision."""
+    monkeypatch.setattr(twins, "ADDED_ELEMENTS", {"walls": pytest.fail})
+    absent = SimpleNamespace(name="walls")
+    assert twins._with_effect(absent, 0.0, curve=None) is None

@@ -185,9 +185,7 @@ def test_walls_take_regularly():
 # --- limits -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=LONG.get(name, ())) for name in GASES]
-)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=LONG.get(name, ())) for name in GASES])
 def test_is_positive_symmetric_and_zero_at_the_start(name):
     gas = GASES[name]
     times = taus(gas, 0.0, 1e-3, 0.1, 0.2, 1, 2, 5, 10, 11, 12, 100, 1e3)
