@@ -1,13 +1,13 @@
 """Plans of experiments: twins, truths, additions, and the range to expect."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import jaxgran
 from jaxgran.fitting import candidates, twins
+from jaxgran.fitting.alternatives import Alternative
 from jaxgran.fitting.kinds import initial_rate
 from jaxgran.fitting.measured_rows import with_errors_that_count
 from jaxgran.fitting.plan import _at_its_fit
@@ -239,5 +239,9 @@ def test_the_width_of_a_negative_parameter_is_positive():
 def test_an_effect_of_amplitude_0_is_no_truth(monkeypatch):
     """Its walls would be infinitely far away in single precision."""
     monkeypatch.setattr(twins, "ADDED_ELEMENTS", {"walls": pytest.fail})
-    absent = SimpleNamespace(name="walls")
-    assert twins._with_effect(absent, 0.0, curve=None) is None
+    one = np.ones(1)
+    numbers = {"amplitude": 0.0, "allowed": (0.0, 0.0), "improvement": 0.0}
+    verdict = {"preferred": False, "distinguishable": True, "error_reduction_needed": 1.0}
+    absent = Alternative("walls", "walls", **numbers, estimate=one, low=one, high=one, **verdict)
+    curve = twins.FittedCurve(GAS, 1.0, 1e-4)
+    assert twins._with_effect(absent, 0.0, curve) is None
