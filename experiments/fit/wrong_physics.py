@@ -14,7 +14,9 @@ with T_rot measured. Finds for each row
 - inside: runs whose range over all explanations contains it;
 - grades: how many runs are determined, not determined, not consistent.
 
-- width: the median of ln(high/low) of this range.
+- width: the median of ln(high/low) of this range;
+- low_of: the median low end with each single alternative, over true A; the lowest one sets that of
+  the range, and is the profile of its likelihood.
 
 In the row "fast grains lost" spheres beyond 2.2 sqrt(2 T) are not seen. In the rows of sizes
 diameters are distributed evenly within 10 % of their mean, or half of the spheres are 1.2 or 1.4
@@ -25,7 +27,7 @@ have no duration, so kinetic theory is used without "softness".
 """
 
 import dataclasses
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -37,6 +39,7 @@ import jaxgran
 from experiments.support.analysis import fit_quietly
 from experiments.support.record import Options, collected, each_alone, figures, run_parts
 from experiments.support.scenes import cool, glass
+from jaxgran.fitting.alternatives import AND
 
 TRUE_A, NUM_PARTICLES, PHI = 3e-6, 250, 0.03
 NUM_POINTS, LAST = 30, 0.03
@@ -215,7 +218,7 @@ def statistics(number: int, runs: int) -> dict:
     """Simulate a row, fit each run, and return statistics."""
     row = ROWS[number]
     times, each, rotation = measured(row, runs)
-    gas, found = beads(**row.fitted), []
+    gas, found, lows = beads(**row.fitted), [], defaultdict(list)
     free = "dissipative_constant", "temperature", *row.free
     for run, T in enumerate(np.asarray(each) + row.floor * float(gas.temperature)):
         T_rot = rotation[run] if row.free else None
@@ -225,6 +228,9 @@ def statistics(number: int, runs: int) -> dict:
         ends = result.ranges.get("dissipative_constant", (np.nan, np.nan))
         numbers = *result.value("dissipative_constant"), *ends
         found.append((*(float(np.squeeze(x)) / TRUE_A for x in numbers), result.grade))
+        for alternative in result.alternatives:
+            if AND not in alternative.name and alternative.restitution is None:
+                lows[alternative.name].append(float(alternative.low[0]) / TRUE_A)
     *numbers, grades = zip(*found, strict=True)
     A, error, low, high = np.array(numbers)
     known = np.isfinite(low)
@@ -240,6 +246,7 @@ def statistics(number: int, runs: int) -> dict:
         "inside_or_flagged": int(np.sum(inside | (np.array(grades) == "not consistent"))),
         "range": [float(np.median(x[known])) if known.any() else None for x in (low, high)],
         "width": float(np.median(np.log(high / low)[known])) if known.any() else None,
+        "low_of": {name: float(np.median(ends)) for name, ends in sorted(lows.items())},
         "grades": dict(Counter(grades)),
     }
 
