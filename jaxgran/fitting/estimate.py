@@ -12,6 +12,7 @@ from jaxgran.data.curve import CoolingCurve, above_noise
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.alternatives import Explanations, compare_alternatives
+from jaxgran.fitting.descent import Descent
 from jaxgran.fitting.goodness import SIGNIFICANCE, goodness, measurement_share
 from jaxgran.fitting.information import (
     DEGENERATE,
@@ -30,7 +31,7 @@ from jaxgran.fitting.problem import Evaluation, Problem, unknown_of
 from jaxgran.fitting.profiles import ALLOWED
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.rows import SCATTER, WHITE, CurveRows, has_no_measured_errors
-from jaxgran.fitting.search import Descent, Minimum, best_of_starts, minimise
+from jaxgran.fitting.search import Minimum, deepest, minima_from_starts, minimise
 from jaxgran.fitting.setup import Request, build_problem, problem_with_rate_errors
 from jaxgran.models.checks import describe_walls
 from jaxgran.models.scales import scales_at
@@ -93,7 +94,8 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
 def _search(problem: Problem, first: np.ndarray, max_steps: int, descent: Descent | None) -> _Ends:
     """Return where the searches end, with errors of T if the data show them."""
     if descent is not None:  # it keeps the errors of the cooling rate that it began with
-        best, minima = best_of_starts(problem, first, max_steps, descent)
+        minima = minima_from_starts(problem, first, max_steps, descent)
+        best = deepest(minima)
         check_computed(problem, best)
         return _Ends(problem, best, minima, problem, goodness(problem, problem.evaluate(best.flat)))
     given, best, minima = _found_by_two_searches(problem, first, max_steps)
@@ -184,7 +186,8 @@ def _found_by_two_searches(
     the model's cooling rate in the gas that the first one found.
     """
     held, is_left = problem.holding(SCATTER)
-    begun, minima = best_of_starts(held, first[is_left], max_steps)
+    minima = minima_from_starts(held, first[is_left], max_steps)
+    begun = deepest(minima)
     check_computed(held, begun)
 
     def whole(flat: np.ndarray) -> np.ndarray:
@@ -195,10 +198,8 @@ def _found_by_two_searches(
     problem = problem_with_rate_errors(problem, whole(begun.flat))
     near = [whole(m.flat) for m in minima if m.value < begun.value + DEGENERATE]
     minima = [minimise(problem, flat, max_steps) for flat in near]
-    end = min(minima, key=lambda minimum: minimum.value)
-    steps = begun.steps + sum(m.steps for m in minima)
-    best = end._replace(steps=steps)
-    return problem, best, minima
+    best = deepest(minima)
+    return problem, best._replace(steps=begun.steps + best.steps), minima
 
 
 def check_computed(problem: Problem, end: Minimum) -> None:

@@ -49,6 +49,10 @@ class Element(NamedTuple):
     place: int
     slope: float
 
+    def applies_to(self, label: str) -> bool:
+        """Tell whether it is an unknown of the measurement with a label."""
+        return self.label is None or self.label == label
+
 
 class Prediction(NamedTuple):
     """A curve at the nodes, which are the times of the data and times between them.
