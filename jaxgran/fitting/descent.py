@@ -80,7 +80,7 @@ class Descent:
     throw: bool
 
     def __call__(self, problem: Problem, first: np.ndarray, max_steps: int) -> Minimum:
-        """Minimise -2 ln L of a model without noise: a `jaxgran.fitting.search.Search`."""
+        """Minimise -2 ln L of a model without noise: a `jaxgran.fitting.search.Minimiser`."""
         objective = Objective(problem, first)
 
         def loss(flat: np.ndarray, step: int) -> Loss:

@@ -30,6 +30,7 @@ COMMON_FACTORS = {ROTATION: (0.0, 1.0), CALIBRATION: (1.0, 1.0)}
 """Nuisance parameters that are logarithms of common factors: whether they apply to T and T_rot."""
 
 TINY = float(np.finfo(np.float32).tiny)
+"""Smallest normal number of float32, which takes the place of 0 in logarithms and quotients."""
 
 
 class Element(NamedTuple):
@@ -82,6 +83,137 @@ class Prediction(NamedTuple):
 
 
 @dataclass(frozen=True)
+class PredictedCurve:
+    """A curve by a model beside the measurement with which it is compared.
+
+    Attributes:
+        rows: the measurement.
+        gas: the gas at these values, with all elements.
+        values: SI values of the parameters, by name.
+        times: of the nodes, s.
+        sonine: a_2 at the nodes.
+        place: place of each time of the data among the nodes.
+        prediction: the curve.
+        tangents: its derivatives in the unknowns, each in its unconstrained scale.
+        elements: the unknowns.
+        fields: the computed curve at the times of the data.
+    """
+
+    rows: CurveRows
+    gas: Gas
+    values: dict[str, Any]
+    times: Float[np.ndarray, "nodes"]
+    sonine: Float[np.ndarray, "nodes"]
+    place: Int[np.ndarray, "times"]
+    prediction: Prediction
+    tangents: list[Prediction]
+    elements: list[Element]
+    fields: dict[str, Any]
+
+    def by_size_ratio(self, gas: Gas, size_ratio: np.ndarray | None) -> np.ndarray | None:
+        """Return the derivative of ln T as measured in q; None for equal spheres.
+
+        Args:
+            gas: one gas, or many whose parameters have a first axis.
+            size_ratio: q, shape (nodes, gases).
+        """
+        if size_ratio is None:
+            return None
+        if not self.rows.measurement.of_energy:
+            return np.zeros_like(size_ratio)
+        return np.asarray(energy_slope(_spread_of(gas), size_ratio))
+
+
+@np.errstate(divide="ignore", invalid="ignore", over="ignore")  # nan where a curve fails
+def predicted_curve(
+    rows: CurveRows,
+    model: AbstractModel,
+    values: dict[str, Any],
+    elements: list[Element],
+    tolerance: float = 1.0,
+    linearise: Callable[..., LinearisedCurve] = linearise,
+) -> PredictedCurve:
+    """Compute the curve of a measurement, with its derivatives.
+
+    Args:
+        rows: the measurement.
+        model: without noise.
+        values: SI values of parameters of the gas, of t0 and of nuisance parameters.
+        elements: the unknowns of this measurement.
+        tolerance: factor of the model's tolerance.
+        linearise: computes the curve.
+    """
+    names = values.keys() & rows.gas.domains.keys()
+    gas = with_parameters(rows.gas, as_floats({name: values[name] for name in names}))
+    elapsed = np.asarray(rows.curve.times) - float(values.get(START_TIME, 0.0))
+    elapsed = elapsed * rows.faster
+    grid = time_grid(np.abs(elapsed), rows.unit_time)
+    is_before = np.zeros(grid.times.size, bool)
+    is_before[grid.place] = elapsed < 0
+    linear = linearise(model, gas, grid.times, {e.name for e in elements}, tolerance)
+    fields = {name: x[grid.place] if np.ndim(x) else x for name, x in linear.values.items()}
+    if "collisions" not in linear.values:
+        counted = _maxwellian_collisions(gas, grid.times, linear.values["temperature"])
+        linear = linear._replace(values=linear.values | {"collisions": counted})
+    curve = _ExpandedCurve(rows, gas, grid, is_before, linear)
+    prediction = curve.prediction(values)
+    return PredictedCurve(
+        rows=rows,
+        gas=gas,
+        values=values,
+        times=grid.times,
+        sonine=curve.value("sonine"),
+        place=grid.place,
+        prediction=prediction,
+        tangents=[curve.tangent(element, prediction) for element in elements],
+        elements=elements,
+        fields=fields,
+    )
+
+
+def steady_curve(
+    model: AbstractModel, gas: Gas, times: np.ndarray, names: Collection[str], tolerance: float
+) -> LinearisedCurve:
+    """Return a curve of a gas that does not cool, in place of `linearise`.
+
+    It has the shapes of a computed curve, for which the programs after it are compiled.
+    """
+    one = np.ones_like(times)
+    values = {"temperature": one, "sonine": one, "collisions": times / times[-1]}
+    if gas.diameter_sd is not None:
+        values["size_ratio"] = one
+    return LinearisedCurve(values, {}, {})
+
+
+def _maxwellian_collisions(gas: Gas, times: np.ndarray, T: np.ndarray) -> np.ndarray:
+    """Return collisions per particle of a Maxwellian gas, for a model that does not count them."""
+    speed = np.sqrt(T / float(gas.temperature))
+    steps = np.diff(times) * (speed[1:] + speed[:-1]) / 2
+    return np.append(0.0, np.cumsum(steps)) * float(gas.collision_frequency)
+
+
+class _EnergyRatio(NamedTuple):
+    """The measured temperature over T, where it is given by the energy of unequal spheres.
+
+    Attributes:
+        log: its logarithm, shape (nodes,).
+        by_spread: the derivative of `log` in the relative spread of the diameters.
+        by_size_ratio: the derivative of `log` in q.
+    """
+
+    log: Float[np.ndarray, "nodes"]
+    by_spread: Float[np.ndarray, "nodes"]
+    by_size_ratio: Float[np.ndarray, "nodes"]
+
+    @classmethod
+    def build(cls, s: np.ndarray, q: Float[np.ndarray, "nodes"]) -> "_EnergyRatio":
+        """Compute it from the relative spread s and the size ratio q (`jaxgran.theory.sizes`)."""
+        ratio = np.asarray(energy_ratio(s, q))
+        by_spread = -3 * ((1 - s**2) / (1 + 3 * s**2)) ** 2 * np.tanh(q / 2) / ratio
+        return cls(np.log(ratio), by_spread, np.asarray(energy_slope(s, q)))
+
+
+@dataclass(frozen=True)
 class _Continuation:
     """Logarithms of temperatures, continued to times before the start.
 
@@ -113,27 +245,6 @@ class _Continuation:
         steepness = self.line / (2 - self.line)
         continued = of_logs[:1] - steepness * (of_logs - of_logs[:1])
         return np.where(self.is_before[:, None], continued, of_logs)
-
-
-class _EnergyRatio(NamedTuple):
-    """The measured temperature over T, where it is given by the energy of unequal spheres.
-
-    Attributes:
-        log: its logarithm, shape (nodes,).
-        by_spread: the derivative of `log` in the relative spread of the diameters.
-        by_size_ratio: the derivative of `log` in q.
-    """
-
-    log: Float[np.ndarray, "nodes"]
-    by_spread: Float[np.ndarray, "nodes"]
-    by_size_ratio: Float[np.ndarray, "nodes"]
-
-    @classmethod
-    def build(cls, s: np.ndarray, q: Float[np.ndarray, "nodes"]) -> "_EnergyRatio":
-        """Compute it from the relative spread s and the size ratio q (`jaxgran.theory.sizes`)."""
-        ratio = np.asarray(energy_ratio(s, q))
-        by_spread = -3 * ((1 - s**2) / (1 + 3 * s**2)) ** 2 * np.tanh(q / 2) / ratio
-        return cls(np.log(ratio), by_spread, np.asarray(energy_slope(s, q)))
 
 
 @dataclass(frozen=True)
@@ -175,7 +286,7 @@ class _ExpandedCurve:
         """The measured T over T: 1 unless spheres are unequal and T is given by the energy."""
         if self.size_ratio is None or not self.rows.measurement.of_energy:
             return _EnergyRatio(self.nothing, self.nothing, self.nothing)
-        return _EnergyRatio.build(spread_of(self.gas), self.size_ratio)
+        return _EnergyRatio.build(_spread_of(self.gas), self.size_ratio)
 
     @cached_property
     def measured(self) -> _Continuation:
@@ -252,7 +363,7 @@ class _ExpandedCurve:
 
     def _slope_of_spread(self, element: Element) -> float:
         """Return the derivative of the relative spread of the diameters."""
-        by_name = {"diameter_sd": 1.0, "diameter": -spread_of(self.gas)}
+        by_name = {"diameter_sd": 1.0, "diameter": -_spread_of(self.gas)}
         return by_name.get(element.name, 0.0) * element.slope / float(self.gas.diameter)
 
 
@@ -266,117 +377,7 @@ def _slopes_of_parameters(
     return slopes
 
 
-@dataclass(frozen=True)
-class PredictedCurve:
-    """A curve by a model beside the measurement with which it is compared.
-
-    Attributes:
-        rows: the measurement.
-        gas: the gas at these values, with all elements.
-        values: SI values of the parameters, by name.
-        times: of the nodes, s.
-        sonine: a_2 at the nodes.
-        place: place of each time of the data among the nodes.
-        prediction: the curve.
-        tangents: its derivatives in the unknowns, each in its unconstrained scale.
-        elements: the unknowns.
-        fields: the computed curve at the times of the data.
-    """
-
-    rows: CurveRows
-    gas: Gas
-    values: dict[str, Any]
-    times: Float[np.ndarray, "nodes"]
-    sonine: Float[np.ndarray, "nodes"]
-    place: Int[np.ndarray, "times"]
-    prediction: Prediction
-    tangents: list[Prediction]
-    elements: list[Element]
-    fields: dict[str, Any]
-
-    def by_size_ratio(self, gas: Gas, size_ratio: np.ndarray | None) -> np.ndarray | None:
-        """Return the derivative of ln T as measured in q; None for equal spheres.
-
-        Args:
-            gas: one gas, or many whose parameters have a first axis.
-            size_ratio: q, shape (nodes, gases).
-        """
-        if size_ratio is None:
-            return None
-        if not self.rows.measurement.of_energy:
-            return np.zeros_like(size_ratio)
-        return np.asarray(energy_slope(spread_of(gas), size_ratio))
-
-
-@np.errstate(divide="ignore", invalid="ignore", over="ignore")  # nan where a curve fails
-def predicted_curve(
-    rows: CurveRows,
-    model: AbstractModel,
-    values: dict[str, Any],
-    elements: list[Element],
-    tolerance: float = 1.0,
-    linearise: Callable[..., LinearisedCurve] = linearise,
-) -> PredictedCurve:
-    """Compute the curve of a measurement, with its derivatives.
-
-    Args:
-        rows: the measurement.
-        model: without noise.
-        values: SI values of parameters of the gas, of t0 and of nuisance parameters.
-        elements: the unknowns of this measurement.
-        tolerance: factor of the model's tolerance.
-        linearise: computes the curve.
-    """
-    names = values.keys() & rows.gas.domains.keys()
-    gas = with_parameters(rows.gas, as_floats({name: values[name] for name in names}))
-    elapsed = np.asarray(rows.curve.times) - float(values.get(START_TIME, 0.0))
-    elapsed = elapsed * rows.faster
-    grid = time_grid(np.abs(elapsed), rows.unit_time)
-    is_before = np.zeros(grid.times.size, bool)
-    is_before[grid.place] = elapsed < 0
-    linear = linearise(model, gas, grid.times, {e.name for e in elements}, tolerance)
-    fields = {name: x[grid.place] if np.ndim(x) else x for name, x in linear.values.items()}
-    if "collisions" not in linear.values:
-        counted = _maxwellian_collisions(gas, grid.times, linear.values["temperature"])
-        linear = linear._replace(values=linear.values | {"collisions": counted})
-    curve = _ExpandedCurve(rows, gas, grid, is_before, linear)
-    prediction = curve.prediction(values)
-    return PredictedCurve(
-        rows=rows,
-        gas=gas,
-        values=values,
-        times=grid.times,
-        sonine=curve.value("sonine"),
-        place=grid.place,
-        prediction=prediction,
-        tangents=[curve.tangent(element, prediction) for element in elements],
-        elements=elements,
-        fields=fields,
-    )
-
-
-def steady_curve(
-    model: AbstractModel, gas: Gas, times: np.ndarray, names: Collection[str], tolerance: float
-) -> LinearisedCurve:
-    """Return a curve of a gas that does not cool, in place of `linearise`.
-
-    It has the shapes of a computed curve, for which the programs after it are compiled.
-    """
-    one = np.ones_like(times)
-    values = {"temperature": one, "sonine": one, "collisions": times / times[-1]}
-    if gas.diameter_sd is not None:
-        values["size_ratio"] = one
-    return LinearisedCurve(values, {}, {})
-
-
-def spread_of(gas: Gas) -> np.ndarray:
+def _spread_of(gas: Gas) -> np.ndarray:
     """Return `Gas.size_spread`; for many gases with a first axis of nodes, shape (1, gases)."""
     spread = np.asarray(gas.size_spread)
     return spread[None] if spread.ndim else spread
-
-
-def _maxwellian_collisions(gas: Gas, times: np.ndarray, T: np.ndarray) -> np.ndarray:
-    """Return collisions per particle of a Maxwellian gas, for a model that does not count them."""
-    speed = np.sqrt(T / float(gas.temperature))
-    steps = np.diff(times) * (speed[1:] + speed[:-1]) / 2
-    return np.append(0.0, np.cumsum(steps)) * float(gas.collision_frequency)

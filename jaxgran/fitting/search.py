@@ -83,7 +83,7 @@ class Minimum(NamedTuple):
     trace: Trace | None = None
 
 
-Search = Callable[[Problem, np.ndarray, int], Minimum]
+Minimiser = Callable[[Problem, np.ndarray, int], Minimum]
 """A search of a problem from a first guess, with a maximum number of steps."""
 
 
@@ -158,6 +158,36 @@ class Objective:
         return newton_step(self.evaluate(flat)).length
 
 
+@dataclass
+class _Ending:
+    """Ends a search after a step, where the next one is short or -2 ln L no longer falls.
+
+    Attributes:
+        objective: of the search.
+        tolerance: length of a short step, in standard errors.
+        last: -2 ln L after the step before.
+        num_stalled: number of steps in succession that hardly lowered it.
+    """
+
+    objective: Objective
+    tolerance: float
+    last: float = np.inf
+    num_stalled: int = 0
+
+    @property
+    def has_stalled(self) -> bool:
+        """Whether -2 ln L no longer falls."""
+        return self.num_stalled >= MAX_STALLED
+
+    def __call__(self, flat: np.ndarray) -> None:
+        value = self.objective.value(flat)
+        has_fallen = value <= self.last - MIN_FALL_OF_STEP
+        self.num_stalled = 0 if has_fallen else self.num_stalled + 1
+        self.last = value
+        if self.objective.newton_length(flat) < self.tolerance or self.has_stalled:
+            raise StopIteration
+
+
 def minimise(
     problem: Problem,
     first: np.ndarray,
@@ -207,38 +237,8 @@ def minimise(
     return Minimum(end, value, int(solution.nit), step.length < limit)
 
 
-@dataclass
-class _Ending:
-    """Ends a search after a step, where the next one is short or -2 ln L no longer falls.
-
-    Attributes:
-        objective: of the search.
-        tolerance: length of a short step, in standard errors.
-        last: -2 ln L after the step before.
-        num_stalled: number of steps in succession that hardly lowered it.
-    """
-
-    objective: Objective
-    tolerance: float
-    last: float = np.inf
-    num_stalled: int = 0
-
-    @property
-    def has_stalled(self) -> bool:
-        """Whether -2 ln L no longer falls."""
-        return self.num_stalled >= MAX_STALLED
-
-    def __call__(self, flat: np.ndarray) -> None:
-        value = self.objective.value(flat)
-        has_fallen = value <= self.last - MIN_FALL_OF_STEP
-        self.num_stalled = 0 if has_fallen else self.num_stalled + 1
-        self.last = value
-        if self.objective.newton_length(flat) < self.tolerance or self.has_stalled:
-            raise StopIteration
-
-
 def minima_from_starts(
-    problem: Problem, first: np.ndarray, max_steps: int, search: Search = minimise
+    problem: Problem, first: np.ndarray, max_steps: int, search: Minimiser = minimise
 ) -> list[Minimum]:
     """Search from a first guess and, if beta_t is free, also with other values of beta_t."""
     starts = [first]
