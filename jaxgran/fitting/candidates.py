@@ -1,7 +1,8 @@
 """Additions to a planned experiment: each is a function of a measurement.
 
-It returns the measurement with the addition, a dictionary of several measurements by label, or None
-where the addition does not apply. The values of T do not matter: `jaxgran.plan` computes them.
+It returns the measurement with the addition, or None where the addition does not apply. A further
+measurement is put `beside` the planned curve. The measured values do not matter: `jaxgran.plan`
+computes them.
 """
 
 import dataclasses
@@ -14,15 +15,17 @@ import numpy as np
 from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.drop_test import DropTest
-from jaxgran.data.header import ABSENT
-from jaxgran.data.measurement import START_TIME, Measurement
+from jaxgran.data.measurement import START_TIME, Measurement, Priors
 from jaxgran.scene.elements import Rough
 
-CURVE = "curve"
-"""Label of the planned curve among several measurements."""
-
 Planned = Measurement | dict[str, Measurement]
+"""An experiment: one measurement, or several by label."""
+
 Change = Callable[[Measurement], Planned | None]
+"""An addition to a planned measurement; it returns None where it does not apply."""
+
+CURVE = "curve"
+"""Label of the planned curve where further measurements are beside it."""
 
 DURATIONS = (2.0, 4.0, 10.0)
 """Factors of the last time."""
@@ -48,6 +51,9 @@ BETA_ERROR = 0.05
 NUM_IMPACTS = 20
 """Number of normal impacts."""
 
+ANY_EPS = 0.9
+"""Restitution of planned impacts, in place of which `jaxgran.plan` computes values."""
+
 IMPACT_ERROR = 0.01
 """Standard error of eps of one impact."""
 
@@ -67,6 +73,9 @@ HOW_TO_SHOW_ABSENCE = {
     "friction": "grains that do not slide at oblique impacts",
 }
 """What shows that an effect is absent, which is the price of its declaration."""
+
+ELEMENT_OF_EFFECT = {"walls": "container", "roughness": "surface", "drag": "drag"}
+"""Element of a scene that an effect adds; friction is a property of the surface."""
 
 
 class Candidate(NamedTuple):
@@ -104,7 +113,12 @@ def standard_candidates(measurement: Measurement) -> list[Candidate]:
             for factor in DURATIONS
         ),
         Candidate("twice the points", "twice as many frames", with_more_points, "errors"),
-        Candidate("half the errors", "four times as many frames or pixels", with_errors, "errors"),
+        Candidate(
+            "half the errors",
+            "four times as many frames or pixels",
+            with_smaller_errors,
+            "errors",
+        ),
         Candidate(
             f"N x {MORE_GRAINS}",
             f"{MORE_GRAINS} times as many grains at this density",
@@ -117,7 +131,12 @@ def standard_candidates(measurement: Measurement) -> list[Candidate]:
             in_larger_box,
             "box",
         ),
-        Candidate("a second density", "a second run", with_second_density, "density"),
+        Candidate(
+            "a second density",
+            "a second run",
+            partial(beside, label="second density", further=second_density),
+            "density",
+        ),
         Candidate(
             f"eps_w known to +-{WALL_ERROR:g}",
             "drops of grains onto the wall",
@@ -133,14 +152,14 @@ def standard_candidates(measurement: Measurement) -> list[Candidate]:
         Candidate(
             f"{NUM_IMPACTS} normal impacts",
             f"eps of each impact to +-{IMPACT_ERROR:g}, at {_impact_speeds(measurement)}",
-            with_impacts,
+            partial(beside, label="impacts", further=normal_impacts),
             "impacts",
         ),
         Candidate(
             f"{NUM_IMPACTS} oblique impacts",
             f"eps to +-{IMPACT_ERROR:g}, eps_t to +-{TANGENTIAL_ERROR:g}, at "
             f"{IMPACT_ANGLES[0]:g} to {IMPACT_ANGLES[1]:g} degrees from the normal",
-            with_oblique_impacts,
+            partial(beside, label="oblique impacts", further=oblique_impacts),
             "impacts",
         ),
         *(
@@ -149,6 +168,14 @@ def standard_candidates(measurement: Measurement) -> list[Candidate]:
         ),
     ]
     return [candidate for candidate in found if candidate.change(measurement) is not None]
+
+
+def beside(
+    measurement: Measurement, label: str, further: Callable[[Measurement], Measurement | None]
+) -> dict[str, Measurement] | None:
+    """Return a planned curve, and a further measurement of the same grains; None without it."""
+    added = further(measurement)
+    return None if added is None else {CURVE: measurement, label: added}
 
 
 def with_rotation(measurement: Measurement) -> Measurement | None:
@@ -177,20 +204,15 @@ def with_duration(measurement: Measurement, factor: float) -> Measurement:
     return with_curve(measurement, times=times + t0)
 
 
-def _start_time(measurement: Measurement) -> float:
-    """Return the time at which a gas begins to cool, s, as it is known."""
-    return float(measurement.priors.get(START_TIME, (0.0, 0.0))[0])
-
-
 def with_more_points(measurement: Measurement) -> Measurement | None:
     """Return a measurement of twice as many points: one of the same times, with the errors of the
     mean of two points."""
     if measurement.curve.temperature_error is None:
         return None
-    return with_errors(measurement, 0.5**0.5)
+    return with_smaller_errors(measurement, 0.5**0.5)
 
 
-def with_errors(measurement: Measurement, factor: float = 0.5) -> Measurement | None:
+def with_smaller_errors(measurement: Measurement, factor: float = 0.5) -> Measurement | None:
     """Return a measurement whose errors are multiplied by a factor."""
     curve = measurement.curve
     if curve.temperature_error is None:
@@ -207,13 +229,11 @@ def with_more_grains(measurement: Measurement, factor: int = MORE_GRAINS) -> Mea
     if measurement.num_particles is None:
         return None
     gas = measurement.gas
-    priors = dict(measurement.priors)
+    priors = measurement.priors
     if gas.container is not None:
         longer = factor ** (1 / gas.dimension)
         gas = gas.replace(wall_side=longer * np.asarray(gas.value("wall_side")))
-        if "wall_side" in priors:
-            value, error = priors["wall_side"]
-            priors["wall_side"] = longer * value, longer * error
+        priors = _with_scaled_prior(priors, "wall_side", longer)
     number = factor * measurement.num_particles
     return dataclasses.replace(measurement, gas=gas, num_particles=number, priors=priors)
 
@@ -225,28 +245,35 @@ def in_larger_box(measurement: Measurement) -> Measurement | None:
     return with_more_grains(measurement, 2**measurement.gas.dimension)
 
 
-def with_second_density(measurement: Measurement) -> dict[str, Measurement]:
-    """Return the curve, and one of a denser gas or, near `MAX_PACKING`, of a more dilute one.
+def second_density(measurement: Measurement) -> Measurement:
+    """Return a measurement of a denser gas or, near `MAX_PACKING`, of a more dilute one.
 
-    A container stays, with more or fewer grains in it.
+    A container stays, with more or fewer grains in it. As many collisions happen in the new times.
     """
     gas = measurement.gas
     ratio = DENSITY_RATIO
     if ratio * float(gas.packing_fraction) > MAX_PACKING:
         ratio = 1 / DENSITY_RATIO
-    second = dataclasses.replace(
-        measurement, gas=gas.replace(packing_fraction=ratio * np.asarray(gas.packing_fraction))
-    )
-    if "packing_fraction" in measurement.priors:
-        value, error = measurement.priors["packing_fraction"]
-        priors = measurement.priors | {"packing_fraction": (ratio * value, ratio * error)}
-        second = dataclasses.replace(second, priors=priors)
     N = measurement.num_particles
     if gas.container is not None and N is not None:
-        second = dataclasses.replace(second, num_particles=max(round(ratio * N), 1))
+        N = max(round(ratio * N), 1)
+    second = dataclasses.replace(
+        measurement,
+        gas=gas.replace(packing_fraction=ratio * np.asarray(gas.packing_fraction)),
+        num_particles=N,
+        priors=_with_scaled_prior(measurement.priors, "packing_fraction", ratio),
+    )
     t0 = _start_time(measurement)
-    times = t0 + (np.asarray(measurement.curve.times) - t0) / ratio  # as many collisions
-    return {CURVE: measurement, "second density": with_curve(second, times=times)}
+    times = t0 + (np.asarray(measurement.curve.times) - t0) / ratio
+    return with_curve(second, times=times)
+
+
+def _with_scaled_prior(priors: Priors, name: str, factor: float) -> Priors:
+    """Return priors in which a parameter, if it has one, and its error are multiplied."""
+    if name not in priors:
+        return priors
+    value, error = priors[name]
+    return priors | {name: (factor * value, factor * error)}
 
 
 def with_prior(measurement: Measurement, name: str, error: float) -> Measurement | None:
@@ -262,74 +289,44 @@ def with_prior(measurement: Measurement, name: str, error: float) -> Measurement
     return dataclasses.replace(measurement, priors=priors)
 
 
-def with_impacts(measurement: Measurement) -> dict[str, Measurement] | None:
-    """Return the curve, and a drop test of normal impacts of two grains."""
+def normal_impacts(measurement: Measurement) -> Measurement | None:
+    """Return a drop test of normal impacts of two grains."""
     gas = measurement.gas
     if "friction" in gas.elements:
         return None
-    thermal = float(np.sqrt(2 * gas.temperature))
-    speed = np.geomspace(*IMPACT_SPEEDS, NUM_IMPACTS) * thermal
-    eps = np.full(NUM_IMPACTS, 0.9)
-    drops = DropTest(speed, eps, np.full(NUM_IMPACTS, IMPACT_ERROR))
-    return {CURVE: measurement, "impacts": Measurement(gas, drops)}
+    speed = np.geomspace(*IMPACT_SPEEDS, NUM_IMPACTS) * _thermal_speed(measurement)
+    eps = np.full(NUM_IMPACTS, ANY_EPS)
+    return Measurement(gas, DropTest(speed, eps, np.full(NUM_IMPACTS, IMPACT_ERROR)))
 
 
-def with_oblique_impacts(measurement: Measurement) -> dict[str, Measurement] | None:
-    """Return the curve, and a drop test of oblique impacts of two rough grains."""
+def oblique_impacts(measurement: Measurement) -> Measurement | None:
+    """Return a drop test of oblique impacts of two rough grains."""
     gas = measurement.gas
     if not isinstance(gas.surface, Rough):
         return None
-    thermal = float(np.sqrt(2 * gas.temperature))
-    speed = np.full(NUM_IMPACTS, thermal)
+    speed = np.full(NUM_IMPACTS, _thermal_speed(measurement))
     angle = np.radians(np.linspace(*IMPACT_ANGLES, NUM_IMPACTS))
     drops = DropTest(
         speed * np.cos(angle),
-        np.full(NUM_IMPACTS, 0.9),
+        np.full(NUM_IMPACTS, ANY_EPS),
         np.full(NUM_IMPACTS, IMPACT_ERROR),
         tangential_speed=speed * np.sin(angle),
         tangential_restitution=np.zeros(NUM_IMPACTS),
         tangential_error=np.full(NUM_IMPACTS, TANGENTIAL_ERROR),
     )
-    return {CURVE: measurement, "oblique impacts": Measurement(gas, drops)}
+    return Measurement(gas, drops)
 
 
 def with_absence(measurement: Measurement, effect: str) -> Measurement | None:
-    """Return a measurement of which an effect is known to be absent."""
+    """Return a measurement of which an effect is known to be absent; None if that is known."""
     gas = measurement.gas
-    present = {"walls": "container", "roughness": "surface", "drag": "drag"}
-    if effect in measurement.absent or present.get(effect) in gas.elements:
+    if effect == "friction":
+        is_possible = gas.surface is not None and "friction" not in gas.domains
+    else:
+        is_possible = ELEMENT_OF_EFFECT[effect] not in gas.elements
+    if effect in measurement.absent or not is_possible:
         return None
-    slides = gas.surface is not None and "friction" not in gas.domains
-    if effect == "friction" and not slides:
-        return None
-    assert effect in ABSENT
     return dataclasses.replace(measurement, absent=(*measurement.absent, effect))
-
-
-def combined(first: Change, second: Change, measurement: Measurement) -> Planned | None:
-    """Return a measurement with two additions; None if one of them does not apply."""
-    changed = first(measurement)
-    if isinstance(changed, Measurement):
-        return second(changed)
-    if changed is None:
-        return None
-    curves = _curves_of(changed)
-    if not curves:
-        return None
-    both = {label: second(changed[label]) for label in curves}
-    main = both[curves[0]]
-    if not isinstance(main, dict):
-        return changed | {label: m for label, m in both.items() if isinstance(m, Measurement)}
-    # Its first curve is the planned one, which has a label already.
-    added = dict(main)
-    for label in _curves_of(main)[:1]:
-        changed = changed | {curves[0]: added.pop(label)}
-    return changed | {label + " 2" * (label in changed): m for label, m in added.items()}
-
-
-def _curves_of(measurements: dict[str, Measurement]) -> list[str]:
-    """Return the labels of measured curves."""
-    return [label for label, m in measurements.items() if isinstance(m.data, CoolingCurve)]
 
 
 def with_curve(measurement: Measurement, **fields: Any) -> Measurement:
@@ -338,7 +335,63 @@ def with_curve(measurement: Measurement, **fields: Any) -> Measurement:
     return dataclasses.replace(measurement, data=curve)
 
 
+def _start_time(measurement: Measurement) -> float:
+    """Return the time at which a gas begins to cool, s, as it is known."""
+    return float(measurement.priors.get(START_TIME, (0.0, 0.0))[0])
+
+
+def _thermal_speed(measurement: Measurement) -> float:
+    return float(np.sqrt(2 * measurement.gas.temperature))
+
+
 def _impact_speeds(measurement: Measurement) -> str:
-    thermal = float(np.sqrt(2 * measurement.gas.temperature))
-    low, high = (x * thermal for x in IMPACT_SPEEDS)
+    low, high = (x * _thermal_speed(measurement) for x in IMPACT_SPEEDS)
     return f"{low:.2g} to {high:.2g} m/s"
+
+
+def combined(first: Change, second: Change, measurement: Measurement) -> Planned | None:
+    """Return a measurement with two additions.
+
+    Where the first addition gives several measurements, the second one changes each curve of them.
+    If the second one gives several, too, only those that it makes of the first curve are taken.
+
+    Returns:
+        None if the first addition does not apply, or none of its measurements is a curve, or if the
+        second one does not apply to its only measurement.
+    """
+    changed = first(measurement)
+    if changed is None:
+        return None
+    if isinstance(changed, Measurement):
+        return second(changed)
+    labels = _labels_of_curves(changed)
+    if not labels:
+        return None
+    both = {label: second(changed[label]) for label in labels}
+    of_first_curve = both[labels[0]]
+    if isinstance(of_first_curve, dict):
+        return _with_added(changed, labels[0], of_first_curve)
+    return changed | {label: m for label, m in both.items() if isinstance(m, Measurement)}
+
+
+def _with_added(
+    measurements: dict[str, Measurement], label: str, added: dict[str, Measurement]
+) -> dict[str, Measurement]:
+    """Return measurements with those that an addition makes of the curve with a label.
+
+    The first curve among the latter is this curve itself, and keeps its label.
+    """
+    of_curve = _labels_of_curves(added)[:1]
+    result = dict(measurements)
+    for name, m in added.items():
+        if name in of_curve:
+            result[label] = m
+        elif name in measurements:
+            result[f"{name} 2"] = m
+        else:
+            result[name] = m
+    return result
+
+
+def _labels_of_curves(measurements: dict[str, Measurement]) -> list[str]:
+    return [label for label, m in measurements.items() if isinstance(m.data, CoolingCurve)]

@@ -12,6 +12,7 @@ from jaxgran.data.curve import CoolingCurve, above_noise
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.alternatives import Explanations, compare_alternatives
+from jaxgran.fitting.descent import Descent
 from jaxgran.fitting.goodness import SIGNIFICANCE, goodness, measurement_share
 from jaxgran.fitting.information import (
     DEGENERATE,
@@ -30,7 +31,7 @@ from jaxgran.fitting.problem import Evaluation, Problem, unknown_of
 from jaxgran.fitting.profiles import ALLOWED
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.rows import SCATTER, WHITE, CurveRows, has_no_measured_errors
-from jaxgran.fitting.search import Descent, Minimum, best_of_starts, minimise
+from jaxgran.fitting.search import Minimum, deepest, minima_from_starts, minimise
 from jaxgran.fitting.setup import Request, build_problem, problem_with_rate_errors
 from jaxgran.models.base import Limitation
 from jaxgran.models.checks import describe_walls
@@ -110,8 +111,8 @@ def _search(problem: Problem, first: np.ndarray, max_steps: int, descent: Descen
     if descent is None:
         end = _found_by_two_searches(problem, first, max_steps)
     else:  # it keeps the errors of the cooling rate that it began with
-        best, minima = best_of_starts(problem, first, max_steps, descent)
-        end = _End(problem, best, minima)
+        minima = minima_from_starts(problem, first, max_steps, descent)
+        end = _End(problem, deepest(minima), minima)
     check_computed(end.problem, end.best)
     return end
 
@@ -123,7 +124,8 @@ def _found_by_two_searches(problem: Problem, first: np.ndarray, max_steps: int) 
     the model's cooling rate in the gas that the first one found.
     """
     held, is_left = problem.holding(SCATTER)
-    begun, minima = best_of_starts(held, first[is_left], max_steps)
+    minima = minima_from_starts(held, first[is_left], max_steps)
+    begun = deepest(minima)
     check_computed(held, begun)
 
     def whole(flat: np.ndarray) -> np.ndarray:
@@ -134,9 +136,8 @@ def _found_by_two_searches(problem: Problem, first: np.ndarray, max_steps: int) 
     problem = problem_with_rate_errors(problem, whole(begun.flat))
     near = [whole(m.flat) for m in minima if m.value < begun.value + DEGENERATE]
     minima = [minimise(problem, flat, max_steps) for flat in near]
-    deepest = min(minima, key=lambda minimum: minimum.value)
-    steps = begun.steps + sum(m.steps for m in minima)
-    return _End(problem, deepest._replace(steps=steps), minima)
+    best = deepest(minima)
+    return _End(problem, best._replace(steps=begun.steps + best.steps), minima)
 
 
 def _with_errors_of_T(end: _End, first: np.ndarray, max_steps: int) -> _End:

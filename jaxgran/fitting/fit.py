@@ -13,6 +13,7 @@ from jaxgran._utils.validation import check_bool, checked_int
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import DENSITY, START_TIME, Measurement, Priors
+from jaxgran.fitting.descent import Descent, is_transformation
 from jaxgran.fitting.estimate import fit_without_noise
 from jaxgran.fitting.learnt_law import describe_unvisited_knots
 from jaxgran.fitting.measured_rows import unused_displacements, unused_rotation
@@ -25,7 +26,6 @@ from jaxgran.fitting.parameters import (
     with_names_of_law,
 )
 from jaxgran.fitting.result import Fit
-from jaxgran.fitting.search import Descent, is_transformation
 from jaxgran.fitting.setup import Request
 from jaxgran.fitting.simulated_fit import fit_through_simulations
 from jaxgran.fitting.simulations import MAX_LINEARISED

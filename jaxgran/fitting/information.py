@@ -1,13 +1,18 @@
-"""What a measurement tells about the unknowns of a fit, and by which cause they err."""
+"""Fisher information of measurements on the unknowns of a fit, and the causes of their errors."""
 
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Collection
+from functools import partial
 
 import numpy as np
+from jaxtyping import Bool, Float
 
+from jaxgran.fitting.comparison import Residuals
 from jaxgran.fitting.problem import Evaluation, Problem
 from jaxgran.fitting.rows import SCATTER
 from jaxgran.fitting.search import Minimum
 from jaxgran.scene.gas import law_fields
+from jaxgran.scene.laws import RestitutionLaw
 
 DEGENERATE = 9.0
 """Difference of -2 ln L up to which two minima are equally good: three standard errors."""
@@ -19,7 +24,11 @@ SOURCE_STEP = 0.02
 """Relative change of a variance by which its part of an error is found."""
 
 MIN_EIGENVALUE = 1e-12
-"""Least information on a combination of parameters: their error is then infinite to all ends."""
+"""Smallest information on a combination of parameters, so that its error stays finite."""
+
+MIN_SHARE = 0.05
+"""Share of a parameter in an undetermined combination, over the largest share, from which the
+parameter is itself undetermined."""
 
 FEW_PARTICLES = "few particles"
 """Part of an error by the randomness of collisions of N grains."""
@@ -40,35 +49,50 @@ def information_by_source(
     """Return the information on all unknowns, as the variance of the estimate's score by source.
 
     A variance that grows by a share a lowers the information by a times its part.
+
+    Args:
+        problem: of a fit.
+        flat: the estimate, in the unconstrained scale.
+        found: -2 ln L there.
     """
-    parts: dict[str, np.ndarray] = {}
+    parts: defaultdict[str, np.ndarray] = defaultdict(lambda: np.zeros_like(found.information))
+    for source in _sources_of_curves(problem):
+        with_variance = partial(_information_of_curves, problem, flat, source)
+        parts[source] += decrease_with_variance(with_variance)
+    for row in found.rows:
+        # What the scatter itself tells is as uncertain as few grains make it.
+        parts[FEW_PARTICLES] += 0.5 * row.log_slopes.T @ row.log_slopes
+        if row.name != "curve":
+            parts[_source_of(row)] += row.slopes.T @ row.slopes
+    return {name: part for name, part in parts.items() if np.any(part)}
 
-    def add(name: str, part: np.ndarray) -> None:
-        parts[name] = parts.get(name, 0.0) + part
 
-    def linear(evaluation: Evaluation) -> np.ndarray:
-        return sum(
-            (row.slopes.T @ row.slopes for row in evaluation.rows if row.name == "curve"),
-            np.zeros_like(found.information),
-        )
-
+def _sources_of_curves(problem: Problem) -> list[str]:
+    """Return the causes of the scatter of the measured curves about theory."""
+    if not problem.curves:
+        return []
     sources = ["measurement", FEW_PARTICLES, "model"]
     if any(m.grains.sample > 0 for m in problem.curves):
         sources.append(SAMPLING)
     if any(np.any(np.asarray(m.simulation) > 0) for m in problem.curves):
         sources.append("simulation")
-    for name in sources if problem.curves else []:
-        add(
-            name, decrease_with_variance(lambda x, n=name: linear(problem.evaluate(flat, **{n: x})))
-        )
-    for row in found.rows:
-        # What the scatter itself tells is as uncertain as few grains make it.
-        add(FEW_PARTICLES, 0.5 * row.log_slopes.T @ row.log_slopes)
-        if row.name == "curve":
-            continue
-        name = row.name if row.is_prior else "measurement"
-        add(FEW_PARTICLES if name == SCATTER else name, row.slopes.T @ row.slopes)
-    return {name: part for name, part in parts.items() if np.any(part)}
+    return sources
+
+
+def _information_of_curves(
+    problem: Problem, flat: np.ndarray, source: str, factor: float
+) -> np.ndarray:
+    """Return the information from values of T and T_rot, with a factor of a source's variance."""
+    found = problem.evaluate(flat, **{source: factor})
+    parts = [row.slopes.T @ row.slopes for row in found.rows if row.name == "curve"]
+    return sum(parts, np.zeros_like(found.information))
+
+
+def _source_of(row: Residuals) -> str:
+    """Return the cause of the error of residuals other than those of T and T_rot."""
+    if not row.is_prior:
+        return "measurement"
+    return FEW_PARTICLES if row.name == SCATTER else row.name
 
 
 def decrease_with_variance(information: Callable[[float], np.ndarray]) -> np.ndarray:
@@ -91,13 +115,18 @@ def positive(matrix: np.ndarray) -> np.ndarray:
 def covariance_of_minima(
     problem: Problem, end: Minimum, minima: list[Minimum], covariance: np.ndarray
 ) -> np.ndarray:
-    """Return the covariance of the estimates by minima that are nearly as deep, SI."""
-    p = problem.num_free
-    error = np.sqrt(np.diag(covariance))[:p]
+    """Return the covariance of the estimates by minima that are nearly as deep, SI.
+
+    Args:
+        problem: of a fit.
+        end: the deepest minimum.
+        minima: all minima.
+        covariance: of all unknowns, in their unconstrained scale.
+    """
+    error = _errors_of_free(problem, covariance)
     kept = [end]
     for m in sorted(minima, key=lambda minimum: minimum.value):
-        nearest = min(np.max(np.abs(m.flat - x.flat)[:p] / error) for x in kept)
-        if nearest > 1:
+        if min(_distance(m, other, error) for other in kept) > 1:
             kept.append(m)
     distance = np.stack([problem.estimates(m.flat) - problem.estimates(end.flat) for m in kept])
     weights = np.exp([(end.value - m.value) / 2 for m in kept])
@@ -107,17 +136,31 @@ def covariance_of_minima(
 def equally_good_minima(
     problem: Problem, end: Minimum, minima: list[Minimum], covariance: np.ndarray
 ) -> np.ndarray:
-    """Return the estimates at other minima that are as good, and apart by three standard errors."""
-    p = problem.num_free
-    error = np.sqrt(np.diag(covariance))[:p]
+    """Return the estimates at other minima that are as good, three standard errors or more apart.
+
+    Args:
+        problem, end, minima, covariance: see `covariance_of_minima`.
+    """
+    error = _errors_of_free(problem, covariance)
     solutions: list[np.ndarray] = []
     for m in minima:
-        apart = np.max(np.abs(m.flat - end.flat)[:p] / error) > DEGENERATE**0.5
+        is_deep = m.value < end.value + DEGENERATE
+        is_apart = _distance(m, end, error) > DEGENERATE**0.5
         estimate = problem.estimates(m.flat)
-        known = any(np.allclose(estimate, other, rtol=1e-3) for other in solutions)
-        if m.value < end.value + DEGENERATE and apart and not known:
+        is_known = any(np.allclose(estimate, other, rtol=1e-3) for other in solutions)
+        if is_deep and is_apart and not is_known:
             solutions.append(estimate)
-    return np.array(solutions).reshape(-1, p)
+    return np.array(solutions).reshape(-1, problem.num_free)
+
+
+def _errors_of_free(problem: Problem, covariance: np.ndarray) -> np.ndarray:
+    """Return the standard errors of the free parameters, in their unconstrained scale."""
+    return np.sqrt(np.diag(covariance))[: problem.num_free]
+
+
+def _distance(a: Minimum, b: Minimum, error: np.ndarray) -> float:
+    """Return the largest distance of a free parameter between two minima, in standard errors."""
+    return float(np.max(np.abs(a.flat - b.flat)[: error.size] / error))
 
 
 def weights_of_measurements(problem: Problem, found: Evaluation) -> dict[str, np.ndarray]:
@@ -142,23 +185,28 @@ def undetermined(problem: Problem, found: Evaluation) -> tuple[str, ...]:
     value is below ``model.derivative_accuracy`` times the largest. Parameters of a law with a
     smoothness prior, and arrays in parts of a law, such as a neural network, are not among them.
     """
-    gas = problem.measurements[0].scene
-    without_meaning = law_fields(gas.law).keys() - gas.law.domains.keys()
-    left_out = law_fields(gas.law) if gas.law.prior_residuals().size else without_meaning
     p = problem.num_free
     measured = [row.slopes[:, :p] for row in found.rows if not row.is_prior]
     priors = [row.slopes[:, :p] for row in found.rows if row.is_prior]
     sensitivity = np.concatenate(measured + priors)
+    _, singular, axes = np.linalg.svd(sensitivity, full_matrices=False)
+    is_weak = _take_part(axes[singular <= UNDETERMINED_ERROR])
     size = np.maximum(np.linalg.norm(sensitivity, axis=0), np.finfo(float).tiny)
-    is_weak = np.zeros(p, bool)
-    accuracy = problem.model.derivative_accuracy
-    for scale, limit in ((np.ones(p), UNDETERMINED_ERROR), (size, accuracy)):
-        _, singular, rotation = np.linalg.svd(sensitivity / scale, full_matrices=False)
-        least = limit * (singular[0] if scale is size else 1.0)
-        share = np.abs(rotation[singular <= least])
-        is_weak |= np.any(share > 0.05 * share.max(axis=1, initial=0.0, keepdims=True), axis=0)
-    titles_of_elements = np.repeat(
-        [u.title for u in problem.unknowns], [u.size for u in problem.unknowns]
-    )[:p]
-    weak = [str(name) for name, is_so in zip(titles_of_elements, is_weak, strict=True) if is_so]
-    return tuple(dict.fromkeys(name for name in weak if name not in left_out))
+    _, singular, axes = np.linalg.svd(sensitivity / size, full_matrices=False)
+    is_weak |= _take_part(axes[singular <= problem.model.derivative_accuracy * singular[0]])
+    titles = problem.per_element([u.title for u in problem.unknowns])[:p]
+    left_out = _exempt_parameters(problem.measurements[0].scene.law)
+    return tuple(dict.fromkeys(str(x) for x in titles[is_weak] if x not in left_out))
+
+
+def _take_part(combinations: Float[np.ndarray, "k p"]) -> Bool[np.ndarray, "p"]:
+    """Tell which parameters take part in any of some combinations of them."""
+    share = np.abs(combinations)
+    return np.any(share > MIN_SHARE * share.max(axis=1, initial=0.0, keepdims=True), axis=0)
+
+
+def _exempt_parameters(law: RestitutionLaw) -> Collection[str]:
+    """Return the parameters of a law that need not be determined one by one."""
+    if law.prior_residuals().size:
+        return law_fields(law).keys()
+    return law_fields(law).keys() - law.domains.keys()

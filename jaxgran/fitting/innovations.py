@@ -8,6 +8,7 @@ that: ``-2 ln L = sum innovation^2/variance + ln variance``. No matrix of all po
 that a curve of a thousand points costs no more than its points.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -95,24 +96,47 @@ class Innovations(NamedTuple):
     density_changes: Any
 
 
-class _Steps(NamedTuple):
-    """What happens to the variables of a run from each node's predecessor to it.
-
-    The variables of the run (`jaxgran.theory.covariance.process`) are followed by the relative
-    error of theory's cooling rate over its standard deviation, and by the sampling error: n
-    variables in all.
+class Filtered(NamedTuple):
+    """Innovations of columns of residuals, which share their variances.
 
     Attributes:
-        start: covariance of the variables of the run at its start, shape (n - 2, n - 2, gases).
-        growth: propagators less 1, shape (nodes, n, n, gases).
-        increments: what is added to the covariance, shape (nodes, n, n, gases).
-        rotation_slope: derivative of ln T_rot in y, 0 for smooth spheres, shape (nodes, gases).
+        values: 0 where nothing is used, shape (nodes, 2, columns, gases).
+        variances: of the innovations; where nothing is used, the variance that a value would
+            have; shape (nodes, 2, gases).
     """
 
-    start: Any
-    growth: Any
-    increments: Any
-    rotation_slope: Any
+    values: Any
+    variances: Any
+
+
+def innovations(
+    gas: Gas,
+    nodes: Nodes,
+    log_computed: Float[Array, "nodes 2 gases"],
+    sensitivity: Float[Array, "nodes gases"],
+    observed: Observed,
+    noise: Noise,
+) -> Innovations:
+    """Return the innovations of a measured curve about some gases.
+
+    Args:
+        gas: neighbouring scenes: its floats have an axis (gases,).
+        nodes: their curves by kinetic theory.
+        log_computed: ln T and ln T_rot with which the measured values are compared.
+        sensitivity: derivative of the computed ln T in ln T of the gas: 1 without a noise floor.
+        observed: the measured values.
+        noise: what makes them scatter; its `inverse_number` and `white` have the shape (gases,).
+    """
+    values = observed.values[..., None]
+    errors = observed.errors[..., None]
+    residuals = log_ratio(values, log_computed, errors)
+    variances = (errors / jnp.exp(log_computed)) ** 2 + observed.simulation[..., None]
+    variances = variances.at[:, 0].add(noise.white[None] ** 2)
+    found = filtered(
+        gas, nodes, residuals[:, :, None], variances, sensitivity, observed.used, noise
+    )
+    changes = log_density_change(values, log_computed, errors)
+    return Innovations(found.values[:, :, 0], found.variances, changes)
 
 
 def log_ratio(values: Array, log_computed: Array, errors: Array) -> Array:
@@ -155,35 +179,6 @@ def _share_of_log(log_computed: Array, errors: Array) -> Array:
     return share**2 * (3 - 2 * share)
 
 
-def innovations(
-    gas: Gas,
-    nodes: Nodes,
-    log_computed: Float[Array, "nodes 2 gases"],
-    sensitivity: Float[Array, "nodes gases"],
-    observed: Observed,
-    noise: Noise,
-) -> Innovations:
-    """Return the innovations of a measured curve about some gases.
-
-    Args:
-        gas: neighbouring scenes: its floats have an axis (gases,).
-        nodes: their curves by kinetic theory.
-        log_computed: ln T and ln T_rot with which the measured values are compared.
-        sensitivity: derivative of the computed ln T in ln T of the gas: 1 without a noise floor.
-        observed: the measured values.
-        noise: what makes them scatter; its `inverse_number` and `white` have the shape (gases,).
-    """
-    values = observed.values[..., None]
-    errors = observed.errors[..., None]
-    residuals = log_ratio(values, log_computed, errors)
-    variances = (errors / jnp.exp(log_computed)) ** 2 + observed.simulation[..., None]
-    variances = variances.at[:, 0].add(noise.white[None] ** 2)
-    found, spread = filtered(
-        gas, nodes, residuals[:, :, None], variances, sensitivity, observed.used, noise
-    )
-    return Innovations(found[:, :, 0], spread, log_density_change(values, log_computed, errors))
-
-
 def filtered(
     gas: Gas,
     nodes: Nodes,
@@ -193,11 +188,8 @@ def filtered(
     used: Float[Array, "nodes 2"],
     noise: Noise,
     differentiable: bool = False,
-) -> tuple[Float[Array, "nodes 2 columns gases"], Float[Array, "nodes 2 gases"]]:
+) -> Filtered:
     """Return the innovations of columns of residuals, and the variances that they share.
-
-    An innovation is 0 where nothing is used, and the variance is then that which a value would
-    have.
 
     Args:
         residuals: of T and of T_rot, relative.
@@ -207,86 +199,172 @@ def filtered(
     """
     with jax.numpy_rank_promotion("allow"):  # the gases are the last axis of all arrays
         steps = _steps(gas, nodes, noise, differentiable)
-        by_size = nodes.by_size_ratio
-        return _run_filter(steps, residuals, variances, sensitivity, used, noise, by_size)
+        size = steps.growth.shape[1]
+        mean = jnp.zeros((size, *residuals.shape[2:]), residuals.dtype)
+        start = _State(mean, _start_covariance(steps, noise, mean))
+        at_nodes = _AtNode(
+            growth=steps.growth,
+            increment=steps.increments,
+            sensitivity=sensitivity,
+            rotation_slope=steps.rotation_slope,
+            values=residuals,
+            variances=variances + SMALLEST_VARIANCE,
+            used=used,
+            by_size_ratio=nodes.by_size_ratio,
+        )
+        unit = jnp.eye(size, dtype=mean.dtype)[..., None]
+        _, found = jax.lax.scan(partial(_filter_step, unit), start, at_nodes)
+    return found
 
 
-def _run_filter(
-    steps: _Steps,
-    residuals: Float[Array, "nodes 2 columns gases"],
-    variances: Float[Array, "nodes 2 gases"],
-    sensitivity: Float[Array, "nodes gases"],
-    used: Float[Array, "nodes 2"],
-    noise: Noise,
-    by_size_ratio: Float[Array, "nodes gases"] | None = None,
-) -> tuple[Float[Array, "nodes 2 columns gases"], Float[Array, "nodes 2 gases"]]:
-    """Return innovations and variances, see `filtered`."""
-    dtype = residuals.dtype
-    num_gases = residuals.shape[-1]
-    size = steps.growth.shape[1]
+class _Steps(NamedTuple):
+    """What happens to the variables of a run from each node's predecessor to it.
+
+    The variables of the run (`jaxgran.theory.covariance.process`) are followed by the relative
+    error of theory's cooling rate over its standard deviation, and by the sampling error: n
+    variables in all.
+
+    Attributes:
+        start: covariance of the variables of the run at its start, shape (n - 2, n - 2, gases).
+        growth: propagators less 1, shape (nodes, n, n, gases).
+        increments: what is added to the covariance, shape (nodes, n, n, gases).
+        rotation_slope: derivative of ln T_rot in y, 0 for smooth spheres, shape (nodes, gases).
+    """
+
+    start: Any
+    growth: Any
+    increments: Any
+    rotation_slope: Any
+
+
+class _State(NamedTuple):
+    """What is expected of the n variables of a run, given all values so far.
+
+    Attributes:
+        mean: shape (n, columns, gases).
+        covariance: shape (n, n, gases).
+    """
+
+    mean: Array
+    covariance: Array
+
+
+class _AtNode(NamedTuple):
+    """One node in the filter: the way to it, and what is measured there.
+
+    Attributes:
+        growth, increment, rotation_slope: see `_Steps`.
+        sensitivity, values, variances, used: see `filtered`; `values` are its residuals.
+        by_size_ratio: see `Nodes`.
+    """
+
+    growth: Array
+    increment: Array
+    sensitivity: Array
+    rotation_slope: Array
+    values: Array
+    variances: Array
+    used: Array
+    by_size_ratio: Array | None
+
+
+def _start_covariance(steps: _Steps, noise: Noise, mean: Array) -> Array:
+    """Return the covariance of all variables at t = 0."""
+    size = len(mean)
     rate_error = size - 2
     sample = size - 1
-    first = jnp.zeros((size, size, num_gases), dtype)
+    first = jnp.zeros((size, size, mean.shape[-1]), mean.dtype)
     first = first.at[:rate_error, :rate_error].set(steps.start)
     first = first.at[LOG_T, LOG_T].add(noise.inverse_number * noise.first)
     first = first.at[rate_error, rate_error].set(1.0)
-    first = first.at[sample, sample].set(noise.sample)
-    mean = jnp.zeros((size, *residuals.shape[2:]), dtype)
-    variances = variances + SMALLEST_VARIANCE
-    unit = jnp.eye(size, dtype=dtype)[..., None]
+    return first.at[sample, sample].set(noise.sample)
 
-    def update(state, weights, value, variance, is_used):
-        """Return the state after a value, its innovation and its variance.
 
-        The value is the sum of the variables with these weights, shape (n, gases), and an
-        independent error of the given variance.
-        """
-        mean, covariance = state
-        with_value = jnp.sum(covariance * weights, axis=1)
-        whole = jnp.sum(weights * with_value, axis=0) + variance
-        innovation = is_used * (value - jnp.sum(weights[:, None] * mean, axis=0))
-        gain = is_used * with_value / whole
-        mean = mean + gain[:, None] * innovation[None]
-        covariance = covariance - whole * gain[:, None] * gain[None]
-        return (mean, covariance), innovation, whole
+def _filter_step(unit: Array, state: _State, at: _AtNode) -> tuple[_State, Filtered]:
+    """Return the state after the values of a node, and their innovations and variances.
 
-    def step(state, at):
-        mean, covariance = state
-        growth, increment, share, rotation_slope, values, errors, is_used, by_size = at
-        mean = mean + jnp.sum(growth[:, :, None] * mean[None], axis=1)
-        moved = covariance + product(growth, covariance)
-        covariance = moved + product(moved, transposed(growth)) + increment
-        state = mean, covariance
-        # Measured: ln T of the gas with the sampling error, and ln T_rot = ln T + ln(T_rot/T).
-        of_T = share * unit[LOG_T] + unit[sample]
-        if by_size is not None:  # T by the energy also depends on q
-            of_T = of_T + share * by_size * unit[RATIO]
-        of_rotation = unit[LOG_T] + rotation_slope * unit[RATIO]
-        found = []
-        spread = []
-        for column, weights in enumerate((of_T, of_rotation)):
-            state, innovation, variance = update(
-                state, weights, values[column], errors[column], is_used[column]
-            )
-            found.append(innovation)
-            spread.append(variance)
-        return state, (jnp.stack(found), jnp.stack(spread))
+    Args:
+        unit: unit vectors of the variables, shape (n, n, 1).
+        state: at the node before.
+        at: the node.
+    """
+    growth = at.growth
+    mean = state.mean + jnp.sum(growth[:, :, None] * state.mean[None], axis=1)
+    moved = state.covariance + product(growth, state.covariance)
+    covariance = moved + product(moved, transposed(growth)) + at.increment
+    state = _State(mean, covariance)
+    # Measured: ln T of the gas with the sampling error, and ln T_rot = ln T + ln(T_rot/T).
+    sample = len(mean) - 1
+    of_T = at.sensitivity * unit[LOG_T] + unit[sample]
+    if at.by_size_ratio is not None:  # T by the energy also depends on q
+        of_T = of_T + at.sensitivity * at.by_size_ratio * unit[RATIO]
+    of_rotation = unit[LOG_T] + at.rotation_slope * unit[RATIO]
+    found = []
+    spread = []
+    for column, weights in enumerate((of_T, of_rotation)):
+        state, innovation, variance = _with_value(
+            state, weights, at.values[column], at.variances[column], at.used[column]
+        )
+        found.append(innovation)
+        spread.append(variance)
+    return state, Filtered(jnp.stack(found), jnp.stack(spread))
 
-    at = (
-        steps.growth,
-        steps.increments,
-        sensitivity,
-        steps.rotation_slope,
-        residuals,
-        variances,
-        used,
-        by_size_ratio,
-    )
-    _, innovations_and_variances = jax.lax.scan(step, (mean, first), at)
-    return innovations_and_variances
+
+def _with_value(
+    state: _State, weights: Array, value: Array, variance: Array, used: Array
+) -> tuple[_State, Array, Array]:
+    """Return the state after a value, its innovation and its variance.
+
+    The value is the sum of the variables with these weights, shape (n, gases), and an independent
+    error of the given variance.
+    """
+    mean, covariance = state
+    with_value = jnp.sum(covariance * weights, axis=1)
+    whole = jnp.sum(weights * with_value, axis=0) + variance
+    innovation = used * (value - jnp.sum(weights[:, None] * mean, axis=0))
+    gain = used * with_value / whole
+    mean = mean + gain[:, None] * innovation[None]
+    covariance = covariance - whole * gain[:, None] * gain[None]
+    return _State(mean, covariance), innovation, whole
 
 
 def _steps(gas: Gas, nodes: Nodes, noise: Noise, differentiable: bool) -> _Steps:
+    process = _process(gas, nodes, noise)
+    shape = process.drift.shape
+    flat = (*shape[:2], -1)
+    doublings = NUM_DOUBLINGS if differentiable else _needed_doublings(process.drift)
+    of_run = propagators(process.drift.reshape(flat), process.noise.reshape(flat), doublings)
+    growth, increments = (_with_one_more_variable(x.reshape(shape)) for x in of_run)
+    # The sampling error is independent of all others.
+    sample = shape[0]
+    collisions = _change(nodes.collisions)
+    forgotten = jnp.expm1(-SAMPLE_MEMORY * collisions)
+    sampled = -noise.sample * jnp.expm1(-2 * SAMPLE_MEMORY * collisions)
+    turning = nodes.rotation > 0
+    slope = (nodes.rotation + ROTATION_OFFSET) / jnp.where(turning, nodes.rotation, jnp.inf)
+    return _Steps(
+        start=process.start,
+        growth=growth.at[:, sample, sample].set(forgotten),
+        increments=increments.at[:, sample, sample].set(sampled),
+        rotation_slope=slope,
+    )
+
+
+class _Process(NamedTuple):
+    """The linear stochastic equation of the variables of a run and of the error of the rate.
+
+    Attributes:
+        start: covariance of the variables of the run at its start, see `_Steps`.
+        drift: matrix of the equation times each step, shape (n - 1, n - 1, nodes, gases).
+        noise: covariance of its noise times each step, of the same shape.
+    """
+
+    start: Array
+    drift: Array
+    noise: Array
+
+
+def _process(gas: Gas, nodes: Nodes, noise: Noise) -> _Process:
     first = nodes.log_temperature[:1]
     means = Mean(
         nodes.log_temperature - first,
@@ -300,9 +378,10 @@ def _steps(gas: Gas, nodes: Nodes, noise: Noise, differentiable: bool) -> _Steps
     collisions = _change(nodes.collisions)
     rate_error = len(jacobian)
     size = rate_error + 1
-    drift = jnp.zeros((size, size, *nodes.rotation.shape), jacobian.dtype)
-    noises = drift.at[:rate_error, :rate_error].set(noise.inverse_number * spread * collisions)
-    drift = drift.at[:rate_error, :rate_error].set(jacobian * collisions)
+    nothing = jnp.zeros((size, size, *nodes.rotation.shape), jacobian.dtype)
+    of_run = noise.inverse_number * spread * collisions
+    noises = nothing.at[:rate_error, :rate_error].set(of_run)
+    drift = nothing.at[:rate_error, :rate_error].set(jacobian * collisions)
     # An error of the rate moves all temperatures along their mean course.
     error = _middle(noise.rate_error)[:, None]
     change_of_T = _change(nodes.log_temperature)
@@ -313,25 +392,18 @@ def _steps(gas: Gas, nodes: Nodes, noise: Noise, differentiable: bool) -> _Steps
     if nodes.size_ratio is not None:
         drift = drift.at[RATIO, rate_error].set(error * _change(nodes.size_ratio))
     memory = jnp.abs(change_of_T) / RATE_ERROR_LENGTH
-    drift = drift.at[rate_error, rate_error].set(-memory)
-    noises = noises.at[rate_error, rate_error].set(2 * memory)
-    flat = size, size, -1
-    needed: Any = NUM_DOUBLINGS
-    if not differentiable:
-        # A step is so short that no variable changes by more than 1/64 of itself.
-        longest = jnp.max(jnp.abs(drift))
-        needed = jnp.clip(jnp.ceil(jnp.log2(64 * longest)), 1, NUM_DOUBLINGS).astype(int)
-    of_run = propagators(drift.reshape(flat), noises.reshape(flat), needed)
-    growth, increments = (_with_one_more_variable(x.reshape(drift.shape)) for x in of_run)
-    # The sampling error is independent of all others.
-    sample = size
-    forgotten = jnp.expm1(-SAMPLE_MEMORY * collisions)
-    sampled = -noise.sample * jnp.expm1(-2 * SAMPLE_MEMORY * collisions)
-    growth = growth.at[:, sample, sample].set(forgotten)
-    increments = increments.at[:, sample, sample].set(sampled)
-    turning = nodes.rotation > 0
-    slope = (nodes.rotation + ROTATION_OFFSET) / jnp.where(turning, nodes.rotation, jnp.inf)
-    return _Steps(noise.inverse_number * starts[:, :, 0], growth, increments, slope)
+    return _Process(
+        start=noise.inverse_number * starts[:, :, 0],
+        drift=drift.at[rate_error, rate_error].set(-memory),
+        noise=noises.at[rate_error, rate_error].set(2 * memory),
+    )
+
+
+def _needed_doublings(drift: Array) -> Array:
+    """Return the number of doublings of a step so short that no variable changes by more than 1/64
+    of itself."""
+    longest = jnp.max(jnp.abs(drift))
+    return jnp.clip(jnp.ceil(jnp.log2(64 * longest)), 1, NUM_DOUBLINGS).astype(int)
 
 
 def _with_one_more_variable(x: Float[Array, "n n nodes gases"]) -> Array:

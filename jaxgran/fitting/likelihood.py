@@ -1,23 +1,37 @@
 """The logarithm of the likelihood of a measured curve, a pure function of the gas.
 
-It is the likelihood of `jaxgran.fitting.innovations`, which every fit maximises. What a fit treats
-as nuisance parameters is integrated out.
+Every fit maximises the same likelihood (`jaxgran.fitting.comparison`), of which it takes the
+derivatives by hand, in numpy. Here it is written in jax.numpy, and what a fit treats as nuisance
+parameters is integrated out. Its parts are:
+
+- the residuals of ln T and ln T_rot: `log_ratio` of the measured values and of `_log_measured`;
+- their covariance C, which `filtered` applies without forming it: the collisions of N grains and
+  the error of theory's cooling rate, from `CurveRows.noise`, and the errors of the measurement;
+- common factors of T and T_rot: further columns beside the residuals, see `_common_factors`;
+- the residuals of ln <dr^2>, with a covariance of their own: `Displacement.whitening`.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxgran.data.curve import DEFAULTS, CoolingCurve
 from jaxgran.data.measurement import START_TIME, Measurement
-from jaxgran.fitting.innovations import Nodes, filtered, log_density_change, log_ratio
+from jaxgran.fitting.innovations import (
+    Filtered,
+    Nodes,
+    filtered,
+    log_density_change,
+    log_ratio,
+)
 from jaxgran.fitting.measured_rows import curve_rows, with_rate_error
 from jaxgran.fitting.parameters import guess_from_data
-from jaxgran.fitting.prediction import times_with_nodes
-from jaxgran.fitting.rows import CALIBRATION, ROTATION, CurveRows, Displacement
+from jaxgran.fitting.prediction import COMMON_FACTORS
+from jaxgran.fitting.rows import CurveRows, Observed
+from jaxgran.fitting.time_grid import TimeGrid, time_grid
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_model
 from jaxgran.models.kinetic_theory import KineticTheory
@@ -33,9 +47,6 @@ STEPS_OF_UNKNOWN_N = np.linspace(-2.5, 2.5, 25)
 
 LAW_CONSTANTS = ("dissipative_constant", "coefficient", "drops")
 """Parameters of laws that `guess_from_data` knows."""
-
-COMMON_FACTORS = {ROTATION: (0.0, 1.0), CALIBRATION: (1.0, 1.0)}
-"""Whether a common factor of known width applies to T and to T_rot."""
 
 
 def log_likelihood(
@@ -87,13 +98,12 @@ def log_likelihood(
     model.check_scene(gas)
     with jax.ensure_compile_time_eval():  # the measurement is known, where the gas is traced
         data = _data(measurement, model)
-    computed = model.simulate(gas, jnp.asarray(data.times), DEFAULTS)
-    nodes = _nodes(gas, data.times, computed, measurement.of_energy)
+    times = data.grid.times
+    computed = model.simulate(gas, jnp.asarray(times), DEFAULTS)
+    nodes = _nodes(gas, times, computed, measurement.of_energy)
     value = _likelihood_of_temperatures(gas, nodes, data)
     if data.rows.displacement is not None:
-        value = value + _likelihood_of_displacement(
-            data.rows.displacement, nodes, computed, data.place
-        )
+        value = value + _likelihood_of_displacement(nodes, computed, data)
     return jnp.where(jnp.isnan(value), -jnp.inf, value)
 
 
@@ -102,50 +112,76 @@ class _Data(NamedTuple):
 
     Attributes:
         rows: as it is compared with the model, with the error of its cooling rate.
-        times: of the nodes, s.
-        place: place of each time of the data among them.
+        grid: times at which the model computes it.
+        observed: the measured values among these.
+        steps_of_N: values of ln N over which a likelihood is integrated, in standard errors of its
+            prior.
     """
 
     rows: CurveRows
-    times: Float[np.ndarray, "nodes"]
-    place: Int[np.ndarray, "times"]
+    grid: TimeGrid
+    observed: Observed
+    steps_of_N: Float[np.ndarray, "steps"]
 
 
 def _data(measurement: Measurement, model: AbstractModel) -> _Data:
     rows, _ = curve_rows("", measurement, model, fits_T_0=False, fits_t0=False)
     guess = guess_from_data(measurement.gas, rows.curve, LAW_CONSTANTS)
     rows = with_rate_error(rows, model, guess)
-    times, place = times_with_nodes(np.asarray(rows.curve.times) * rows.faster, rows.unit_time)
-    return _Data(rows, times, place)
+    grid = time_grid(np.asarray(rows.curve.times) * rows.faster, rows.unit_time)
+    observed = jax.tree.map(jnp.asarray, rows.at_nodes(grid.times.size, grid.place))
+    is_known = measurement.num_particles is not None
+    return _Data(rows, grid, observed, STEPS_OF_KNOWN_N if is_known else STEPS_OF_UNKNOWN_N)
 
 
 def _nodes(gas: Gas, times: np.ndarray, computed: CoolingCurve, of_energy: bool) -> Nodes:
     """Return a computed curve as nodes, without the axis of gases."""
     nothing = jnp.zeros_like(computed.temperature)
     T_rot = computed.rotational_temperature
+    collisions = computed.collisions
+    if collisions is None:
+        collisions = _maxwellian_collisions(gas, times, computed.temperature)
     size_ratio = None
     by_size_ratio = None
     if computed.size_ratio is not None:
         size_ratio = jnp.log(computed.size_ratio)
         by_size_ratio = energy_slope(gas.size_spread, size_ratio) if of_energy else nothing
     return Nodes(
-        jnp.asarray(times),
-        jnp.log(computed.temperature),
-        nothing if T_rot is None else T_rot / computed.temperature,
-        nothing if computed.sonine is None else computed.sonine,
-        _collisions(gas, times, computed),
-        size_ratio,
-        by_size_ratio,
+        times=jnp.asarray(times),
+        log_temperature=jnp.log(computed.temperature),
+        rotation=nothing if T_rot is None else T_rot / computed.temperature,
+        sonine=nothing if computed.sonine is None else computed.sonine,
+        collisions=collisions,
+        size_ratio=size_ratio,
+        by_size_ratio=by_size_ratio,
     )
 
 
-def _collisions(gas: Gas, times: np.ndarray, computed: CoolingCurve) -> Array:
-    """Return collisions per particle; of a Maxwellian gas for a model that does not count them."""
-    if computed.collisions is not None:
-        return computed.collisions
-    speed = jnp.sqrt(computed.temperature / gas.temperature)
+def _maxwellian_collisions(gas: Gas, times: np.ndarray, T: Array) -> Array:
+    """Return collisions per particle of a Maxwellian gas, for a model that does not count them."""
+    speed = jnp.sqrt(T / gas.temperature)
     steps = jnp.diff(times) * (speed[1:] + speed[:-1]) / 2 * gas.collision_frequency
     return jnp.append(0.0, jnp.cumsum(steps))
+
+
+def _likelihood_of_temperatures(gas: Gas, nodes: Nodes, data: _Data) -> Float[Array, ""]:
+    """Return the logarithm of the likelihood of T and T_rot."""
+    observed = data.observed
+    logs = _log_measured(gas, nodes, data.rows.measurement.of_energy)
+    residuals = log_ratio(observed.values, logs, observed.errors)
+    variances = (observed.errors / jnp.exp(logs)) ** 2
+    factors = _common_factors(data.rows, residuals.shape)
+    columns = jnp.stack([residuals, *factors.shapes], axis=-1)
+    found = _filtered_for_each_N(gas, nodes, columns, variances, data)
+
+    def at_one_N(found: Filtered, step: Array) -> Array:
+        square = _without_factors(found.values, observed.used / found.variances, factors.widths)
+        log_determinant = jnp.sum(observed.used * jnp.log(found.variances))
+        return -0.5 * (square + log_determinant + step**2)
+
+    each = jax.vmap(at_one_N, in_axes=(-1, 0))(found, jnp.asarray(data.steps_of_N))
+    change = log_density_change(observed.values, logs, observed.errors)
+    return jax.scipy.special.logsumexp(each) - 0.5 * jnp.sum(observed.used * change)
 
 
 def _log_measured(gas: Gas, nodes: Nodes, of_energy: bool) -> Float[Array, "nodes 2"]:
@@ -158,52 +194,62 @@ def _log_measured(gas: Gas, nodes: Nodes, of_energy: bool) -> Float[Array, "node
     return logs
 
 
-def _likelihood_of_temperatures(gas: Gas, nodes: Nodes, data: _Data) -> Float[Array, ""]:
-    """Return the logarithm of the likelihood of T and T_rot."""
-    rows = data.rows
-    observed = jax.tree.map(jnp.asarray, rows.at_nodes(data.times.size, data.place))
-    logs = _log_measured(gas, nodes, rows.measurement.of_energy)
-    residuals = log_ratio(observed.values, logs, observed.errors)
-    variances = (observed.errors / jnp.exp(logs)) ** 2
-    common_factors = {name: x for name, x in COMMON_FACTORS.items() if name in rows.nuisances}
-    shapes = [jnp.broadcast_to(jnp.asarray(x), residuals.shape) for x in common_factors.values()]
-    widths = jnp.asarray([rows.nuisances[name] for name in common_factors])
-    is_known = rows.measurement.num_particles is not None
-    steps = STEPS_OF_KNOWN_N if is_known else STEPS_OF_UNKNOWN_N
-    factors_of_N = jnp.exp(rows.grains.log_error * steps)
+class _CommonFactors(NamedTuple):
+    """Logarithms of common factors of T and T_rot, Gaussian about 0.
 
-    def with_axis_of_N(x: Any) -> Any:
-        """Return an array with a last axis, of values of N."""
-        return None if x is None else jnp.broadcast_to(x[..., None], (*x.shape, steps.size))
+    Attributes:
+        shapes: derivative of the residuals in each of them, shape (nodes, 2).
+        widths: their standard deviations.
+    """
 
-    each = Nodes(*(with_axis_of_N(x) for x in nodes))
-    values, spread = filtered(
+    shapes: list[Float[Array, "nodes 2"]]
+    widths: Float[Array, "factors"]
+
+
+def _common_factors(rows: CurveRows, shape: tuple[int, ...]) -> _CommonFactors:
+    names = [name for name in COMMON_FACTORS if name in rows.nuisances]
+    shapes = [jnp.broadcast_to(jnp.asarray(COMMON_FACTORS[name]), shape) for name in names]
+    return _CommonFactors(shapes, jnp.asarray([rows.nuisances[name] for name in names]))
+
+
+def _filtered_for_each_N(
+    gas: Gas,
+    nodes: Nodes,
+    columns: Float[Array, "nodes 2 columns"],
+    variances: Float[Array, "nodes 2"],
+    data: _Data,
+) -> Filtered:
+    """Return what `filtered` does with values of N in place of its neighbouring gases."""
+    steps = data.steps_of_N
+
+    def with_axis_of_N(x: Array) -> Array:
+        return jnp.broadcast_to(x[..., None], (*x.shape, steps.size))
+
+    each = jax.tree.map(with_axis_of_N, nodes)
+    noise = data.rows.noise(data.grid.times, jnp.exp(data.rows.grains.log_error * steps))
+    return filtered(
         jax.tree.map(lambda x: jnp.broadcast_to(x, (steps.size, *jnp.shape(x))), gas),
         each._replace(times=nodes.times, sonine=nodes.sonine),
-        with_axis_of_N(jnp.stack([residuals, *shapes], axis=-1)),
+        with_axis_of_N(columns),
         with_axis_of_N(variances),
         with_axis_of_N(jnp.ones_like(nodes.log_temperature)),
-        observed.used,
-        jax.tree.map(jnp.asarray, rows.noise(data.times, factors_of_N)),
+        data.observed.used,
+        jax.tree.map(jnp.asarray, noise),
         differentiable=True,
     )
 
-    def of_scatter(values: Array, spread: Array, step: Array) -> Array:
-        square = _without_factors(values, observed.used / spread, widths)
-        return -0.5 * (square + jnp.sum(observed.used * jnp.log(spread)) + step**2)
 
-    each_value = jax.vmap(of_scatter, in_axes=(-1, -1, 0))
-    value = jax.scipy.special.logsumexp(each_value(values, spread, jnp.asarray(steps)))
-    change = log_density_change(observed.values, logs, observed.errors)
-    return value - 0.5 * jnp.sum(observed.used * change)
+def _without_factors(
+    columns: Float[Array, "*shape columns"],
+    weights: Float[Array, "*shape"],
+    widths: Float[Array, "factors"],
+) -> Float[Array, ""]:
+    """Return -2 ln L of the first column r, ``r^T W r``, with its common factors integrated out.
 
-
-def _without_factors(values: Array, weights: Array, widths: Array) -> Array:
-    """Return ``r^T W r`` of the first column r, with its common factors integrated out.
-
-    The factors have the shapes of the other columns, and are Gaussian about 0 with these widths.
+    The further columns F are the shapes of the factors, which are Gaussian about 0 with the widths
+    s. They add ``F s^2 F^T`` to the covariance W^-1, and ``ln det(1 + s F^T W F s)`` to -2 ln L.
     """
-    flat = values.reshape(-1, values.shape[-1])
+    flat = columns.reshape(-1, columns.shape[-1])
     weights = weights.reshape(-1)
     square = jnp.sum(weights * flat[:, 0] ** 2)
     if not widths.size:
@@ -211,16 +257,18 @@ def _without_factors(values: Array, weights: Array, widths: Array) -> Array:
     others = flat[:, 1:] * widths[None]
     projection = others.T @ (weights * flat[:, 0])
     matrix = jnp.eye(widths.size) + others.T @ (weights[:, None] * others)
-    return (
-        square - projection @ jnp.linalg.solve(matrix, projection) + jnp.linalg.slogdet(matrix)[1]
-    )
+    explained = projection @ jnp.linalg.solve(matrix, projection)
+    return square - explained + jnp.linalg.slogdet(matrix)[1]
 
 
 def _likelihood_of_displacement(
-    measured: Displacement, nodes: Nodes, computed: CoolingCurve, place: np.ndarray
+    nodes: Nodes, computed: CoolingCurve, data: _Data
 ) -> Float[Array, ""]:
     """Return the logarithm of the likelihood of <dr^2>."""
-    assert computed.displacement is not None
+    measured = data.rows.displacement
+    assert measured is not None and computed.displacement is not None
+    place = data.grid.place
+    # The common factor is one of D: the ballistic flight before collisions has no error.
     collisions = nodes.collisions[place]
     diffusive = collisions / (1 + collisions)
     known = jnp.where(measured.used, computed.displacement[place], 1.0)

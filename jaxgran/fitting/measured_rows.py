@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 from jaxgran._utils.validation import float_array
 from jaxgran.data.curve import NOISE
 from jaxgran.data.measurement import Measurement
-from jaxgran.fitting.prediction import TINY, times_with_nodes
+from jaxgran.fitting.prediction import TINY
 from jaxgran.fitting.rows import (
     BEYOND_ROUNDING,
     CurveRows,
@@ -19,6 +19,7 @@ from jaxgran.fitting.rows import (
     Grains,
     rounding_errors,
 )
+from jaxgran.fitting.time_grid import time_grid
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.choose import error_model_of_curve
 from jaxgran.models.kinetic_theory import KineticTheory
@@ -330,7 +331,7 @@ def with_rate_error(rows: CurveRows, model: AbstractModel, gas: Gas) -> CurveRow
         gas: the scene, with values of the unknowns.
     """
     known = np.asarray(rows.curve.times) * rows.faster
-    times, _ = times_with_nodes(known, rows.unit_time)
+    times = time_grid(known, rows.unit_time).times
     exact = KineticTheory() if model.stochastic else model
     curve = curve_of_program(exact, gas, times, rows.displacement is not None)
     if not np.all(np.isfinite(np.asarray(curve.temperature))):

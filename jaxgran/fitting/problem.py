@@ -1,6 +1,6 @@
 """The problem of a fit: measurements, unknowns, and -2 ln L with its derivatives."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -82,7 +82,9 @@ class Problem:
     priors: dict[str, Priors]
     fixed: dict[str, dict[str, Any]] = field(default_factory=dict)
     tolerance: float = 1.0
-    _evaluations: dict[bytes, Evaluation] = field(init=False, default_factory=dict, compare=False)
+    _evaluations: dict[tuple[Any, ...], Evaluation] = field(
+        init=False, default_factory=dict, compare=False
+    )
     _curves: dict[str, tuple[bytes, PredictedCurve]] = field(
         init=False, default_factory=dict, compare=False
     )
@@ -138,7 +140,7 @@ class Problem:
         """Return the problem with the unknowns of a name held at 0, and which ones are left."""
         unknowns = tuple(u for u in self.unknowns if u.name != name)
         fixed = {m.label: self.fixed.get(m.label, {}) | {name: 0.0} for m in self.measurements}
-        names = np.repeat([u.name for u in self.unknowns], [u.size for u in self.unknowns])
+        names = self.per_element([u.name for u in self.unknowns])
         return replace(self, unknowns=unknowns, fixed=fixed), names != name
 
     def check_points(self) -> None:
@@ -196,11 +198,16 @@ class Problem:
         slopes = [np.ravel(u.domain.slope(value)) * u.unit for u, value in self.parts(flat)]
         return np.concatenate([flat[:0], *slopes])
 
+    def per_element(self, values: Sequence[Any]) -> np.ndarray:
+        """Return one value for each unknown, repeated for each of its elements."""
+        return np.repeat(values, [u.size for u in self.unknowns])
+
     def values(self, flat: Any) -> dict[str, dict[str, Any]]:
         """Return SI values of all parameters that are varied, by label and name."""
         values = {m.label: dict(self.fixed.get(m.label, {})) for m in self.measurements}
         for u, value in self.parts(flat):
-            for label in values if u.label is None else (u.label,):
+            labels = values.keys() if u.label is None else [u.label]
+            for label in labels:
                 values[label][u.name] = value
         return values
 
@@ -220,7 +227,7 @@ class Problem:
             flat: the unknowns, in their unconstrained scale.
             sources: factors of variances, see `jaxgran.fitting.comparison.Comparison`.
         """
-        key = flat.tobytes() + repr(sources).encode()
+        key = (flat.tobytes(), *sources.items())
         kept = self._evaluations
         if key not in kept:
             if len(kept) == MAX_KEPT:
@@ -232,50 +239,24 @@ class Problem:
     def _evaluate(self, flat: np.ndarray, sources: dict[str, float]) -> Evaluation:
         values = self.values(flat)
         elements = self.elements(flat)
-        rows: list[Residuals] = []
-        curves: dict[str, dict[str, Any]] = {}
-
-        def add(name: str, label: str | None, row: Any, slopes: Any, is_prior: bool = True) -> None:
-            rows.append(_of_unit_variance(name, label, row, slopes, elements, is_prior))
-
         impacts = [
             (m, _compared_impacts(m, values[m.label]))
             for m in self.measurements
             if isinstance(m, DropRows)
         ]
-        for m, found in impacts:
-            slopes = {name: x / found.widening[:, None] for name, x in found.slopes.items()}
-            add("drop test", m.label, found.residuals / found.widening, slopes, is_prior=False)
-            rows[-1] = rows[-1]._replace(log_variance=2 * np.log(found.widening))
         scatter = _common_scatter(impacts)
+        rows = [_impact_residuals(m, found, elements) for m, found in impacts]
+        curves: dict[str, dict[str, Any]] = {}
         for m in self.curves:
             own = values[m.label]
             if scatter is not None and "spread" in m.gas.domains:
                 own = {"spread": scatter} | own
             curve = self._curve(m, flat, own, elements)
             rows += Comparison(curve, sources).residuals(len(elements))
+            rows += _nuisance_residuals(m, own, elements)
             curves[m.label] = curve.fields
-            for name, error in m.nuisances.items():
-                row = np.atleast_1d(own[name]) / error
-                add(name, m.label, row, {name: np.ones((1, 1)) / error})
-        for label, priors in self.priors.items():
-            at = label or self.measurements[0].label
-            gas = next(m.gas for m in self.measurements if m.label == at)
-            for name, (row, slopes) in prior_residuals(priors, gas, values[at]).items():
-                add(name, label or None, row, slopes)
-        return summed(rows, curves)._replace(scatter_of_eps=scatter)
-
-    def compile_innovations(self, flat: np.ndarray) -> None:
-        """Compile what an evaluation needs apart from the curves, whatever these are."""
-        values = self.values(flat)
-        elements = self.elements(flat)
-        for m in self.curves:
-            applied = [e for e in elements if e.label in (None, m.label)]
-            model = self.simplified_model
-            curve = predicted_curve(
-                m, model, values[m.label], applied, self.tolerance, steady_curve
-            )
-            Comparison(curve).residuals(len(elements))
+        rows += self._prior_residuals(values, elements)
+        return summed(rows, curves, scatter)
 
     def _curve(
         self, m: CurveRows, flat: np.ndarray, values: dict[str, Any], elements: list[Element]
@@ -283,10 +264,36 @@ class Problem:
         """Return a computed curve: it is computed once for all factors of the variances."""
         known, curve = self._curves.get(m.label, (b"", None))
         if curve is None or known != flat.tobytes():
-            applied = [e for e in elements if e.label in (None, m.label)]
-            curve = predicted_curve(m, self.simplified_model, values, applied, self.tolerance)
+            own = [e for e in elements if e.applies_to(m.label)]
+            curve = predicted_curve(m, self.simplified_model, values, own, self.tolerance)
             self._curves[m.label] = flat.tobytes(), curve
         return curve
+
+    def _prior_residuals(
+        self, values: dict[str, dict[str, Any]], elements: list[Element]
+    ) -> list[Residuals]:
+        rows = []
+        for label, priors in self.priors.items():
+            first = label or self.measurements[0].label
+            gas = next(m.gas for m in self.measurements if m.label == first)
+            for name, (row, slopes) in prior_residuals(priors, gas, values[first]).items():
+                rows.append(_of_unit_variance(name, label or None, row, slopes, elements))
+        return rows
+
+    def compile_innovations(self, flat: np.ndarray) -> None:
+        """Compile what an evaluation needs apart from the curves, whatever these are."""
+        values = self.values(flat)
+        elements = self.elements(flat)
+        for m in self.curves:
+            curve = predicted_curve(
+                m,
+                self.simplified_model,
+                values[m.label],
+                [e for e in elements if e.applies_to(m.label)],
+                self.tolerance,
+                linearise=steady_curve,
+            )
+            Comparison(curve).residuals(len(elements))
 
 
 def unknown_of(name: str, label: str | None, gas: Gas, curves: Iterable[CurveRows]) -> Unknown:
@@ -340,27 +347,63 @@ def _common_scatter(impacts: list[tuple[DropRows, _ComparedImpacts]]) -> float |
     return float(np.average(squares, weights=[m.num_points for m, _ in found]) ** 0.5)
 
 
+def _impact_residuals(m: DropRows, found: _ComparedImpacts, elements: list[Element]) -> Residuals:
+    """Return the residuals of a drop test, whose errors the scatter of eps widens."""
+    slopes = {name: x / found.widening[:, None] for name, x in found.slopes.items()}
+    row = _of_unit_variance(
+        "drop test", m.label, found.residuals / found.widening, slopes, elements, is_prior=False
+    )
+    return row._replace(log_variance=2 * np.log(found.widening))
+
+
+def _nuisance_residuals(
+    m: CurveRows, values: dict[str, Any], elements: list[Element]
+) -> list[Residuals]:
+    """Return the residuals of nuisance parameters, whose expected value is 0."""
+    rows = []
+    for name, error in m.nuisances.items():
+        slopes = {name: np.ones((1, 1)) / error}
+        row = np.atleast_1d(values[name]) / error
+        rows.append(_of_unit_variance(name, m.label, row, slopes, elements))
+    return rows
+
+
 def _of_unit_variance(
     name: str,
     label: str | None,
     values: Any,
     slopes: dict[str, Any],
     elements: list[Element],
-    is_prior: bool,
+    is_prior: bool = True,
 ) -> Residuals:
-    """Return residuals of known variance, from their derivatives in SI values by parameter."""
+    """Return residuals of variance 1, from their derivatives in SI values by parameter."""
     values = np.asarray(values, float)
     matrix = np.zeros((values.size, len(elements)))
     for e in elements:
-        applies = label is None or e.label in (None, label)
+        applies = label is None or e.applies_to(label)
         if applies and e.name in slopes:
             matrix[:, e.place] = np.asarray(slopes[e.name])[:, e.number] * e.slope
-    nothing = np.zeros(values.size)
-    return Residuals(name, label, values, matrix, nothing, np.zeros_like(matrix), is_prior)
+    return Residuals(
+        name,
+        label,
+        values=values,
+        slopes=matrix,
+        log_variance=np.zeros(values.size),
+        log_slopes=np.zeros_like(matrix),
+        is_prior=is_prior,
+    )
 
 
-def summed(rows: list[Residuals], curves: dict[str, dict[str, Any]]) -> Evaluation:
-    """Return -2 ln L of independent residuals, with its derivatives."""
+def summed(
+    rows: list[Residuals],
+    curves: dict[str, dict[str, Any]],
+    scatter_of_eps: float | None = None,
+) -> Evaluation:
+    """Return -2 ln L of independent residuals, with its derivatives.
+
+    Args:
+        rows, curves, scatter_of_eps: see `Evaluation`.
+    """
     value = 0.0
     size = rows[0].slopes.shape[1]
     gradient = np.zeros(size)
@@ -369,4 +412,4 @@ def summed(rows: list[Residuals], curves: dict[str, dict[str, Any]]) -> Evaluati
         value += float(np.sum(row.values**2) + np.sum(row.log_variance))
         gradient += 2 * row.values @ row.slopes + (1 - row.values**2) @ row.log_slopes
         information += row.information
-    return Evaluation(value, gradient, information, rows, curves)
+    return Evaluation(value, gradient, information, rows, curves, scatter_of_eps)

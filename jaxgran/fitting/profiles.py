@@ -11,7 +11,7 @@ from jaxgran.fitting.information import inverse
 from jaxgran.fitting.kinds import Kind
 from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.rows import CurveRows
-from jaxgran.fitting.search import MAX_STEP, minimise, nearest, newton_step
+from jaxgran.fitting.search import MAX_STEP, Objective, minimise, newton_step
 
 ALLOWED = 3.84
 """Increase of -2 ln L over the fitted law up to which its own parameters are allowed (5 % by
@@ -64,7 +64,7 @@ class Trial(NamedTuple):
 def trial_of(
     problem: Problem, amplitude: float, first: np.ndarray, origin: np.ndarray
 ) -> Trial | None:
-    """Fit the unknowns of a problem, in the region around an origin (`nearest`).
+    """Fit the unknowns of a problem, in the region around an origin (`Objective`).
 
     Returns None if it cannot be computed.
     """
@@ -79,7 +79,7 @@ def trial_of(
     # A longer step leaves the region in which -2 ln L is a parabola.
     share = min(1.0, MAX_STEP / max(float(np.max(np.abs(step))), MAX_STEP))
     fall = (2 * share - share**2) * length**2
-    flat = nearest(problem, end.flat + share * step, origin)
+    flat = Objective(problem, origin).nearest(end.flat + share * step)
     return Trial(amplitude, found.value - fall, flat, error)
 
 

@@ -14,6 +14,7 @@ from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.measurement import Measurement
 from jaxgran.fitting.alternatives import Explanations, compare_alternatives
 from jaxgran.fitting.comparison import Residuals
+from jaxgran.fitting.descent import Descent
 from jaxgran.fitting.estimate import (
     describe_gas,
     fit_without_noise,
@@ -40,7 +41,7 @@ from jaxgran.fitting.parameters import (
 from jaxgran.fitting.prediction import predicted_curve
 from jaxgran.fitting.problem import Problem, summed
 from jaxgran.fitting.result import Fit
-from jaxgran.fitting.search import Descent, Minimum
+from jaxgran.fitting.search import Minimum
 from jaxgran.fitting.setup import (
     Request,
     build_problem,

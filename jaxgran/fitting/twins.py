@@ -21,8 +21,8 @@ from jaxgran.fitting.kinds import (
 )
 from jaxgran.fitting.measured_rows import finite_size_cooling_factor
 from jaxgran.fitting.parameters import as_floats, with_parameters
-from jaxgran.fitting.prediction import times_with_nodes
 from jaxgran.fitting.result import Fit
+from jaxgran.fitting.time_grid import time_grid
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.linearise import curve_of_program
 from jaxgran.scene.elements import Rough, StokesDrag, Walls
@@ -214,7 +214,7 @@ def _twin_of_curve(measurement: Measurement, gas: Gas) -> CoolingCurve:
     faster = 1.0 if N is None else float(finite_size_cooling_factor(measurement.gas, float(N)))
     t0 = float(measurement.priors.get(START_TIME, (0.0, 0.0))[0])
     elapsed = np.maximum(np.asarray(measured.times) - t0, 0.0) * faster
-    times, place = times_with_nodes(elapsed, float(gas.mean_free_time))
+    times, place = time_grid(elapsed, float(gas.mean_free_time))
     model = KineticTheory()
     if measured.displacement is None:
         # As in the fit, whose alternatives have Gaussian spins where its spheres are smooth.

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.fitting.candidates import with_duration, with_second_density
+from jaxgran.fitting.candidates import second_density, with_duration
 from jaxgran.fitting.measured_rows import curve_rows
 from tests.beads import glass_beads
 from tests.fitting.curves import A, cooled_beads, fitted, rough_beads
@@ -61,7 +61,7 @@ def test_plans_keep_the_start_of_a_late_clock():
     longer = np.asarray(with_duration(measurement, 2.0).curve.times)
     assert longer[0] == pytest.approx(t0)
     assert longer[-1] - t0 == pytest.approx(2 * TIMES[-1])
-    denser = np.asarray(with_second_density(measurement)["second density"].curve.times)
+    denser = np.asarray(second_density(measurement).curve.times)
     ratio = (denser[1:] - t0) / TIMES[1:]
     np.testing.assert_allclose(ratio, ratio[0], rtol=1e-6)
 

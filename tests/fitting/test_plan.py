@@ -1,6 +1,7 @@
 """Plans of experiments: twins, truths, additions, and the range to expect."""
 
 import dataclasses
+from functools import partial
 
 import numpy as np
 import pytest
@@ -42,6 +43,12 @@ ROUGH = planned(
 )
 
 
+with_impacts = partial(candidates.beside, label="impacts", further=candidates.normal_impacts)
+with_second_density = partial(
+    candidates.beside, label="second density", further=candidates.second_density
+)
+
+
 def names_of(measurement) -> list[str]:
     return [candidate.name for candidate in candidates.standard_candidates(measurement)]
 
@@ -76,12 +83,12 @@ def test_additions_change_what_they_say():
     assert np.allclose((side, error), (0.1, 0.002))
     known = candidates.with_prior(ROUGH, "tangential_restitution", 0.1).priors
     assert float(known["tangential_restitution"][1]) == 0.1
-    dense = candidates.with_second_density(SMOOTH)["second density"]
+    dense = candidates.second_density(SMOOTH)
     assert np.isclose(dense.gas.packing_fraction, 0.15)
     assert np.allclose(dense.curve.times, TIMES / 3)
-    thin = candidates.with_second_density(
+    thin = candidates.second_density(
         planned(glass_beads(packing_fraction=0.12), priors={"packing_fraction": (0.12, 0.006)})
-    )["second density"]
+    )
     assert np.isclose(thin.priors["packing_fraction"][1], 0.002)
 
 
@@ -89,7 +96,9 @@ def test_only_errors_that_a_fit_counts_are_planned():
     """Errors by the grains stay out of a plan, whatever changes; errors of a fit belong to it."""
     of_grains = planned(error=(2 / 3 / 250) ** 0.5, errors_measured=False)
     counted = with_errors_that_count(of_grains)
-    assert counted.curve.temperature_error is None and candidates.with_errors(counted) is None
+    assert (
+        counted.curve.temperature_error is None and candidates.with_smaller_errors(counted) is None
+    )
     assert with_errors_that_count(SMOOTH).curve.temperature_error is not None
     noise = np.exp(0.05 * np.random.default_rng(0).normal(size=TIMES.size))
     noisy = jaxgran.CoolingCurve(TIMES, noise * SMOOTH.curve.temperature)
@@ -101,7 +110,7 @@ def test_only_errors_that_a_fit_counts_are_planned():
 @pytest.mark.slow
 def test_a_plan_of_T_0_gives_its_range_with_a_second_density():
     """T_0 belongs to each curve there, and A comes first in that fit."""
-    changes = {"second density": candidates.with_second_density}
+    changes = {"second density": with_second_density}
     free = ("temperature", "dissipative_constant")
     found = jaxgran.plan(SMOOTH, candidates=changes, free=free)
     (second,) = found.additions
@@ -121,28 +130,31 @@ def test_additions_keep_the_labels_of_a_user():
         drops = jaxgran.DropTest([0.1, 0.2], [0.9, 0.88], [0.01, 0.01])
         return {"flight": measurement, "drops": jaxgran.Measurement(measurement.gas, drops)}
 
-    precise = candidates.combined(also_drops, candidates.with_errors, SMOOTH)
+    precise = candidates.combined(also_drops, candidates.with_smaller_errors, SMOOTH)
     assert isinstance(precise, dict) and [*precise] == ["flight", "drops"]
-    expected = candidates.with_errors(SMOOTH)
+    expected = candidates.with_smaller_errors(SMOOTH)
     error = np.asarray(precise["flight"].curve.temperature_error)
     np.testing.assert_array_equal(error, expected.curve.temperature_error)
     # The curve is there once, whatever its label, and no drop test replaces another.
-    three = candidates.combined(candidates.with_impacts, also_drops, SMOOTH)
+    three = candidates.combined(with_impacts, also_drops, SMOOTH)
     assert isinstance(three, dict) and [*three] == ["curve", "impacts", "drops"]
     twice = candidates.combined(also_drops, also_drops, SMOOTH)
     assert isinstance(twice, dict) and [*twice] == ["flight", "drops", "drops 2"]
 
 
 def test_additions_are_combined_in_both_orders():
-    both = candidates.combined(candidates.with_impacts, candidates.with_errors, SMOOTH)
-    reverse = candidates.combined(candidates.with_errors, candidates.with_impacts, SMOOTH)
+    both = candidates.combined(with_impacts, candidates.with_smaller_errors, SMOOTH)
+    reverse = candidates.combined(candidates.with_smaller_errors, with_impacts, SMOOTH)
     for found in (both, reverse):
         assert isinstance(found, dict) and [*found] == ["curve", "impacts"]
         error = found["curve"].curve.temperature_error
         assert np.allclose(error, SMOOTH.curve.temperature_error / 2)
-    three = candidates.combined(candidates.with_impacts, candidates.with_second_density, SMOOTH)
+    three = candidates.combined(with_impacts, with_second_density, SMOOTH)
     assert isinstance(three, dict) and {*three} == {"curve", "impacts", "second density"}
-    assert candidates.combined(candidates.in_larger_box, candidates.with_errors, SMOOTH) is None
+    assert (
+        candidates.combined(candidates.in_larger_box, candidates.with_smaller_errors, SMOOTH)
+        is None
+    )
 
 
 @pytest.mark.slow
@@ -164,10 +176,10 @@ def test_twin_is_the_curve_of_the_truth_with_the_relative_errors():
     assert np.allclose(found.temperature_error, 0.02 * found.temperature)
     few = twin(dataclasses.replace(SMOOTH, num_particles=20)).curve
     assert np.all(few.temperature < twin(many).curve.temperature)
-    drops = candidates.with_impacts(SMOOTH)["impacts"]
+    drops = candidates.normal_impacts(SMOOTH)
     test = twin(drops).data
     assert isinstance(test, jaxgran.DropTest) and np.allclose(test.residuals(GAS), 0.0)
-    oblique = twin(candidates.with_oblique_impacts(ROUGH)["oblique impacts"]).data
+    oblique = twin(candidates.oblique_impacts(ROUGH)).data
     assert isinstance(oblique, jaxgran.DropTest) and np.allclose(oblique.residuals(ROUGH.gas), 0.0)
 
 
@@ -175,7 +187,7 @@ def test_twin_is_the_curve_of_the_truth_with_the_relative_errors():
     ("measurement", "options", "message"),
     [
         (SMOOTH.curve, {}, "expected a jaxgran.Measurement, got a CoolingCurve"),
-        (candidates.with_impacts(SMOOTH)["impacts"], {}, "begins with a cooling curve"),
+        (candidates.normal_impacts(SMOOTH), {}, "begins with a cooling curve"),
         (dataclasses.replace(SMOOTH, num_particles=None), {}, "needs N, the number of grains"),
         (planned(error=3.0), {}, "errors of T are 100 % or more"),
         (SMOOTH, {"candidates": [SMOOTH]}, "candidates must be a dictionary"),

@@ -28,7 +28,7 @@ def test_a_search_stays_in_its_region_and_fits_the_other_unknowns_there(beyond):
     assert found.value == end.value
     # With A held there no step in the other unknowns is left.
     others = found._replace(gradient=found.gradient[1:], information=found.information[1:, 1:])
-    assert newton_step(others)[1] < 0.03  # `CONVERGED_STEP`
+    assert newton_step(others).length < 0.03  # `CONVERGED_STEP`
     # A first guess that is outside of the region, and otherwise at the end, is moved to the edge.
     outside = end.flat.copy()
     outside[0] -= 3.0
