@@ -13,10 +13,10 @@ from jaxgran._utils.validation import check_bool, checked_int
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import DENSITY, START_TIME, Measurement, Priors
+from jaxgran.fitting.conclusions import describe_search
 from jaxgran.fitting.estimate import fit_without_noise
 from jaxgran.fitting.learnt_law import describe_unvisited_knots
 from jaxgran.fitting.measured_rows import unused_displacements, unused_rotation
-from jaxgran.fitting.messages import describe_search
 from jaxgran.fitting.parameters import (
     SHARED,
     SMOOTHNESS,
