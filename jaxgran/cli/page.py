@@ -110,7 +110,10 @@ def _section_of_budget(row: ParameterRow) -> Section:
 def sections_of_plan(planned: Plan, picture: Path, title: str = "What to measure") -> list[Section]:
     """Return the parts of a page on what to measure."""
     head, rows = planned.table
-    return [Section(title, planned.notes, head, rows, _encoded(picture))]
+    section = Section(
+        title, sentences=planned.notes, head=head, rows=rows, picture=_encoded(picture)
+    )
+    return [section]
 
 
 def question_of(command: str, parameter: str) -> str:

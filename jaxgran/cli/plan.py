@@ -52,14 +52,7 @@ def run_plan(
     for file in written:
         check_new(file, overwrite)
         check_writable(file)
-    if path.suffix == ".toml":
-        if given:
-            raise ValueError("--set replaces values of a CSV file. Write them into the TOML file.")
-        with name_in_errors(path):
-            measurement = read_experiment(path)
-    else:
-        measurement = jaxgran.read_measurement(path, parse_settings(given))
-    planned = jaxgran.plan(measurement, free=tuple(free) or None)
+    planned = jaxgran.plan(_read(path, given), free=tuple(free) or None)
     print(planned)
     plotting.save_plan(planned, f"{title_of(path)}: {planned.headline}", picture)
     text = json.dumps(as_json(details_of(planned)), indent=1, allow_nan=False) + "\n"
@@ -74,6 +67,16 @@ def run_plan(
             command=command_of("plan", [path]),
         )
     print(f"\n{list_written(written)}")
+
+
+def _read(path: Path, given: Sequence[str]) -> jaxgran.Measurement:
+    """Return the planned measurement of a scene, or the measured one of a curve."""
+    if path.suffix != ".toml":
+        return jaxgran.read_measurement(path, parse_settings(given))
+    if given:
+        raise ValueError("--set replaces values of a CSV file. Write them into the TOML file.")
+    with name_in_errors(path):
+        return read_experiment(path)
 
 
 def read_experiment(path: Path) -> jaxgran.Measurement:

@@ -16,7 +16,7 @@ from jaxgran.fitting.alternatives import AND, DISTINGUISHABLE_SHARE, Alternative
 from jaxgran.fitting.goodness import SIGNIFICANCE
 from jaxgran.fitting.kinds import DECLARABLE
 from jaxgran.fitting.measured_rows import UNKNOWN_NUMBER
-from jaxgran.fitting.messages import DATA, SPHERES, Message, listed, two_digits
+from jaxgran.fitting.messages import DATA, SPHERES, Message, listed
 from jaxgran.fitting.result import (
     CONDITIONAL,
     DETERMINED,
@@ -346,10 +346,15 @@ def _reasons_of_misfit(result: Fit, misfit: _Misfit) -> Iterator[Message]:
     if misfit.scatters_more:
         as_few = ""
         if len(known) == len(result.measurements) == 1:
-            as_few = Message("as few", number=two_digits(known[0] / result.reduced_chi2))
+            as_few = Message("as few", number=_two_digits(known[0] / result.reduced_chi2))
         yield Message("scatters more", as_few=as_few)
     if misfit.scatters_less:
         yield Message("scatters less" if misfit else "errors too large")
+
+
+def _two_digits(x: float) -> float:
+    """Return a number rounded to two digits, which is then written without an exponent."""
+    return float(f"{x:.2g}")
 
 
 def _scatter(result: Fit) -> Iterator[Message]:
@@ -357,8 +362,8 @@ def _scatter(result: Fit) -> Iterator[Message]:
     for label, (ratio, error) in result.scatter.items():
         if result.measurements[label].num_particles is None and error < 1.0:
             number = UNKNOWN_NUMBER / ratio
-            of_number = two_digits(number * error)
-            yield Message("scatter", of=label, number=two_digits(number), error=of_number)
+            of_number = _two_digits(number * error)
+            yield Message("scatter", of=label, number=_two_digits(number), error=of_number)
 
 
 def _errors_of_T(result: Fit) -> Iterator[Message]:
@@ -448,7 +453,7 @@ def _alternatives(result: Fit) -> Iterator[Message]:
             "eps": alternative.restitution,
             "improvement": alternative.improvement,
             "range": _range(result, low, high),
-            "factor": two_digits(alternative.error_reduction_needed),
+            "factor": _two_digits(alternative.error_reduction_needed),
         }
         if alternative.preferred:
             yield Message("law is preferred" if is_law else "is preferred", **values)
@@ -481,6 +486,6 @@ def describe_search(result: Fit) -> Iterator[Message]:
         places = []
         for minimum in result.other_minima:
             pairs = zip(symbols, minimum, strict=False)
-            values = [Message("place", symbol=symbol, value=x) for symbol, x in pairs]
+            values = [Message("value", symbol=symbol, estimate=x, unit="") for symbol, x in pairs]
             places.append(listed("names", values))
         yield Message("another minimum", places=listed("places", places), **_data(result))

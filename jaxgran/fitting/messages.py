@@ -15,21 +15,25 @@ MESSAGES = {
     "unknown": "{symbol} is not determined",
     "constant": "{headline}. A constant coefficient of restitution, {eps:.3g}, explains the data "
     "{how_well}: then A has no meaning",
-    "as well": "as well",
-    "better": "better",
     "narrowing": "without {effects}, {range}: if this is known, declare `absent: {names}`, or give "
     "{given}",
+    # parts of it
+    "as well": "as well",
+    "better": "better",
     # the verdict
     "not converged": "The search did not converge: do not trust its estimates.",
     "not consistent": "{model_is} not consistent with {data}: do not trust the estimates. "
     "{preferred} {remedy}",
-    "law preferred": "The data prefer a model with {name}.",
-    "preferred": "The data prefer a model with {name}, in which {value}.",
-    "value": "{symbol} = {estimate:.3g} {unit}",
     "not trusted": "{Model} cannot be trusted in this scene, though {data} {fit}. {remedy}",
     "determined": "{model_is} consistent with {data}, {who_determines} {symbol}: {range}. {edge}",
     "not determined": "{model_is} consistent with {data}, which {do} not determine {symbol}: "
     "{why}. {edge}",
+    "not compared": "{model_is} consistent with {data}. Alternatives were not compared: the range "
+    "of {symbol} that they allow is not known. {edge}",
+    # parts of it
+    "law preferred": "The data prefer a model with {name}.",
+    "preferred": "The data prefer a model with {name}, in which {value}.",
+    "value": "{symbol} = {estimate:.3g} {unit}",
     "model is": "{Model} is",
     "models are": "{Model} are",
     "drops alone": "which determine",
@@ -40,18 +44,13 @@ MESSAGES = {
     "all together": "which together determine",
     "edge": "The scene is at the edge of the model's validity.",
     "other minima": "other parameters fit {data} as well",
-    "not compared": "{model_is} consistent with {data}. Alternatives were not compared: the range "
-    "of {symbol} that they allow is not known. {edge}",
     "possible": "{name} cannot be excluded, and {range}",
     # reasons
     "chi2": "reduced chi^2 is {reduced:.3g} for {degrees} degrees of freedom (probability by "
     "chance: {chance})",
-    "chance": "{percent:.2g} %",
-    "nearly certain": "over 99 %",
     "scatters more": "the data scatter more about the model than their errors and N equal spheres "
     "allow: another effect, a mixture of sizes, eps that scatters, fewer grains than given, or "
     "noise of the measurement {as_few}",
-    "as few": "(some {number:g} grains would scatter as much)",
     "scatters less": "the curve scatters less than N equal spheres do: grains that walls cool, "
     "more grains than given, or a curve that was smoothed",
     "rising": "T rises from {first:.3g} to {last:.3g} m^2/s^2, and nothing drives this gas: "
@@ -66,10 +65,6 @@ MESSAGES = {
     "of each": "{label}: chi^2 is {chi2:.3g} for {number} points; its weight in {symbol} is "
     "{weight:.2f}",
     "assumptions": "the model assumes {all}",
-    "far from walls": "far from walls",
-    "in vacuum": "in vacuum",
-    "homogeneous": "at homogeneous density",
-    "in some": "{what} ({labels})",
     "absent": "known to be absent: {names}",
     "quick": "alternatives were not compared, as requested",
     "driven": "alternatives were not compared: the gas is driven",
@@ -89,8 +84,6 @@ MESSAGES = {
     "is {value:.3g} +- {error:.2g}",
     "errors of T": "T scatters by {percent:.2g} % more than its grains can: taken for independent "
     "errors of T, beside which all else is fitted. {advice}",
-    "errors are given": "If T_err are errors of the measurement, say so: `errors: measured`",
-    "no errors are given": "Give T_err if they are known",
     "distant": "nearly every T differs from the fitted one by more than a factor of {ratio:g}: "
     "alternatives were not compared; check the units, the scale of T and T0",
     "max_steps": "the search did not converge: free fewer parameters, or in Python increase "
@@ -100,16 +93,25 @@ MESSAGES = {
     "few particles": "{number} particles are too few for their noise to be known, and cool faster "
     "than a gas: give the model {least} or more",
     "undetermined": "{data} {do} not determine {names}: {why}; free fewer parameters",
-    "weak": "it hardly depends on {names} {hint}",
-    "combination": "it depends only on a combination of {names} {hint}",
-    "forgets": "(a cooling gas forgets its initial temperature)",
-    "A and Y": "(in a gas of hard spheres A and Y enter only as A Y^(2/5))",
-    "place": "{symbol} = {value:.3g}",
     "another minimum": "-2 ln L has another, equally good minimum at {places}: {data} {do} not "
     "distinguish them",
     "slopes": "the derivatives through particles err by an estimated {share:.2g} %, which the "
     "standard error includes: more replicas reduce it, and where the gas has a flow "
     "differences=0.3 in Python",
+    # parts of them
+    "chance": "{percent:.2g} %",
+    "nearly certain": "over 99 %",
+    "as few": "(some {number:g} grains would scatter as much)",
+    "far from walls": "far from walls",
+    "in vacuum": "in vacuum",
+    "homogeneous": "at homogeneous density",
+    "in some": "{what} ({labels})",
+    "errors are given": "If T_err are errors of the measurement, say so: `errors: measured`",
+    "no errors are given": "Give T_err if they are known",
+    "weak": "it hardly depends on {names} {hint}",
+    "combination": "it depends only on a combination of {names} {hint}",
+    "forgets": "(a cooling gas forgets its initial temperature)",
+    "A and Y": "(in a gas of hard spheres A and Y enter only as A Y^(2/5))",
 }
 """Sentences, and parts of them, by name, with places for values."""
 
@@ -163,8 +165,3 @@ class Message:
 def listed(separator: str, parts: Iterable[Any]) -> str:
     """Return parts of a sentence as a list, with a separator of `SEPARATORS` between them."""
     return SEPARATORS[separator].join(map(str, parts))
-
-
-def two_digits(x: float) -> float:
-    """Return a number rounded to two digits, which is then written without an exponent."""
-    return float(f"{x:.2g}")
