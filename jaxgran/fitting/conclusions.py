@@ -46,6 +46,16 @@ UNBOUNDED = 1e3
 DECISIVE_WEIGHT = 0.8
 """Weight in a parameter above which impacts, or curves, are said to determine it."""
 
+MAX_MEASUREMENT_SHARE = 0.5
+"""Share of the errors of the measurement in the variances of T from which too little scatter is
+blamed on these errors, and not on the grains."""
+
+MAX_ERROR_OF_N = 1.0
+"""Standard error of ln N from which N by the scatter of a curve is not reported."""
+
+NEARLY_CERTAIN = 0.99
+"""Probability by chance from which it is not reported in digits."""
+
 MIN_PARTICLES = 50
 """Least number of particles of a model whose noise is known."""
 
@@ -75,7 +85,9 @@ class _Misfit(NamedTuple):
     is_smooth: bool
     rising: list[Message]
 
-    def __bool__(self) -> bool:
+    @property
+    def is_significant(self) -> bool:
+        """Whether the model is not consistent with the data."""
         return self.scatters_more or self.is_smooth or bool(self.rising)
 
 
@@ -211,7 +223,7 @@ def _misfit(result: Fit, measurement_share: float) -> _Misfit:
     return _Misfit(
         scatters_more=result.p_value < SIGNIFICANCE,
         scatters_less=scatters_less,
-        is_smooth=scatters_less and measurement_share < 0.5,
+        is_smooth=scatters_less and measurement_share < MAX_MEASUREMENT_SHARE,
         rising=list(_rising(result)),
     )
 
@@ -239,7 +251,7 @@ def _verdict(result: Fit, misfit: _Misfit, limitations: list[Limitation]) -> Mes
     edge = Message("edge") if limitations else ""
     if not result.converged:
         return Message("not converged")
-    if misfit or preferred:
+    if misfit.is_significant or preferred:
         best = _preferred(result, preferred[0]) if preferred else ""
         return Message("not consistent", preferred=best, remedy=remedy, **values)
     if any(limitation.decisive for limitation in limitations):
@@ -334,8 +346,8 @@ def _who_determines(result: Fit) -> Message:
 
 
 def _chi2(result: Fit) -> Message:
-    is_certain = not result.p_value < 0.99
-    chance = Message("nearly certain" if is_certain else "chance", percent=100 * result.p_value)
+    has_digits = result.p_value < NEARLY_CERTAIN
+    chance = Message("chance" if has_digits else "nearly certain", percent=100 * result.p_value)
     degrees = int(result.degrees_of_freedom)
     return Message("chi2", reduced=result.reduced_chi2, degrees=degrees, chance=chance)
 
@@ -349,7 +361,7 @@ def _reasons_of_misfit(result: Fit, misfit: _Misfit) -> Iterator[Message]:
             as_few = Message("as few", number=_two_digits(known[0] / result.reduced_chi2))
         yield Message("scatters more", as_few=as_few)
     if misfit.scatters_less:
-        yield Message("scatters less" if misfit else "errors too large")
+        yield Message("scatters less" if misfit.is_significant else "errors too large")
 
 
 def _two_digits(x: float) -> float:
@@ -360,7 +372,7 @@ def _two_digits(x: float) -> float:
 def _scatter(result: Fit) -> Iterator[Message]:
     """Yield N by the scatter of each curve for which it is not known."""
     for label, (ratio, error) in result.scatter.items():
-        if result.measurements[label].num_particles is None and error < 1.0:
+        if result.measurements[label].num_particles is None and error < MAX_ERROR_OF_N:
             number = UNKNOWN_NUMBER / ratio
             of_number = _two_digits(number * error)
             yield Message("scatter", of=label, number=_two_digits(number), error=of_number)
