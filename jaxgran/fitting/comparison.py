@@ -108,13 +108,12 @@ class Comparison:
     def _temperature_residuals(self, size: int) -> Residuals:
         """Return the residuals of T, followed by the residuals of T_rot."""
         moving = _elements_that_change_temperatures(self.curve)
-        neighbours = self._innovations_at_neighbours([tangent for _, tangent in moving])
-        here, *pairs = (Innovations(*each) for each in zip(*neighbours, strict=True))
+        here, *steps = self._innovations_at_neighbours([tangent for _, tangent in moving])
         error = np.sqrt(here.variances)
         values = here.values / error
         slopes = np.zeros((values.size, size))
         log_slopes = np.zeros((values.size, size))
-        for (element, _), up, down in zip(moving, pairs[::2], pairs[1::2], strict=True):
+        for (element, _), up, down in zip(moving, steps[::2], steps[1::2], strict=True):
             of_value = (up.values - down.values) / (2 * DIFFERENCE)
             of_log_variance = np.log(up.variances / down.variances) / (2 * DIFFERENCE)
             of_change = (up.density_changes - down.density_changes) / (2 * DIFFERENCE)
@@ -131,10 +130,10 @@ class Comparison:
             log_slopes=log_slopes,
         )
 
-    def _innovations_at_neighbours(self, tangents: list[Prediction]) -> Innovations:
+    def _innovations_at_neighbours(self, tangents: list[Prediction]) -> list[Innovations]:
         """Return innovations at the unknowns, then a step up and a step down along each tangent.
 
-        The shapes are (1 + 2 tangents, 2 times): all times of T, then all times of T_rot.
+        Each has the shape (2 times,): all times of T, then all times of T_rot.
         """
         curve = self.curve
         count = 1 + 2 * len(tangents)
@@ -169,11 +168,11 @@ class Comparison:
             return np.asarray(x)[curve.place, :, :count].transpose(2, 1, 0).reshape(count, -1)
 
         used = curve.rows.used.T.ravel() > 0
-        return Innovations(
-            values=of_data(found.values),
-            variances=np.where(used, of_data(found.variances), 1.0),
-            density_changes=np.where(used, of_data(found.density_changes), 0.0),
-        )
+        values = of_data(found.values)
+        variances = np.where(used, of_data(found.variances), 1.0)
+        density_changes = np.where(used, of_data(found.density_changes), 0.0)
+        rows = zip(values, variances, density_changes, strict=True)
+        return [Innovations(*row) for row in rows]
 
     @property
     def _error_factor(self) -> float:
