@@ -160,8 +160,8 @@ def _first_parameter(result: Fit) -> Message:
     """Return the first parameter with its range; without it if that lies outside of the range."""
     name = result.names[0]
     estimate, error = (float(np.ravel(x)[0]) for x in result.value(name))
-    values = {"estimate": estimate, "error": error, "conditional": CONDITIONAL}
-    values |= _symbol_and_unit(result)
+    values = _symbol_and_unit(result)
+    values |= {"estimate": estimate, "error": error, "conditional": CONDITIONAL}
     if name not in result.ranges:
         return Message("estimate alone", **values)
     low, high = _ends(result)
@@ -171,7 +171,7 @@ def _first_parameter(result: Fit) -> Message:
     return Message("estimate and range", low=low, high=high, **values)
 
 
-def _symbol_and_unit(result: Fit) -> dict[str, str]:
+def _symbol_and_unit(result: Fit) -> dict[str, Any]:
     name = result.names[0]
     return {"symbol": symbol_of(name), "unit": unit_of(name)}
 
@@ -185,7 +185,7 @@ def _ends(result: Fit) -> tuple[float, float]:
 def _range(result: Fit, low: float, high: float) -> Message:
     """Return in which range the first parameter lies."""
     estimate = abs(float(result.estimate[0]))
-    values = {"low": low, "high": high} | _symbol_and_unit(result)
+    values = _symbol_and_unit(result) | {"low": low, "high": high}
     is_open = not high < UNBOUNDED * max(estimate, low)
     if 0 <= low < NEGLIGIBLE_SHARE * estimate:
         return Message("unknown" if is_open else "below", **values)
@@ -460,7 +460,7 @@ def _alternatives(result: Fit) -> Iterator[Message]:
         low = float(alternative.low[0])
         high = float(alternative.high[0])
         is_law = alternative.restitution is not None
-        values = {
+        values: dict[str, Any] = {
             "name": alternative.name,
             "eps": alternative.restitution,
             "improvement": alternative.improvement,
