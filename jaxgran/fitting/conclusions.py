@@ -185,7 +185,8 @@ def _ends(result: Fit) -> tuple[float, float]:
 def _range(result: Fit, low: float, high: float) -> Message:
     """Return in which range the first parameter lies."""
     estimate = abs(float(result.estimate[0]))
-    values = _symbol_and_unit(result) | {"low": low, "high": high}
+    values = _symbol_and_unit(result)
+    values |= {"low": low, "high": high}
     is_open = not high < UNBOUNDED * max(estimate, low)
     if 0 <= low < NEGLIGIBLE_SHARE * estimate:
         return Message("unknown" if is_open else "below", **values)
