@@ -100,7 +100,7 @@ def _import():
     jax.config.update("jax_numpy_rank_promotion", "raise")
     with install_import_hook("jaxgran", "tests.annotations.check"):
         import jaxgran  # noqa: F401
-        from jaxgran.cli.common import use_compilation_cache
+        from jaxgran.cli.cache import use_compilation_cache
 
     assert use_compilation_cache(Path(os.environ[PROGRAMS]))
 

@@ -7,30 +7,39 @@ import time
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Annotated
 
 import jax
-import jax.numpy as jnp
 from cyclopts import App, CycloptsError, Parameter
 
 import jaxgran
-from jaxgran.cli import common
+from jaxgran.cli.cache import use_compilation_cache
+from jaxgran.cli.options import (
+    FitOptions,
+    FreeParameter,
+    ModelName,
+    Several,
+    WholeNumber,
+    check_tolerance,
+    models_by_name,
+)
+from jaxgran.cli.output import check_new, list_written
+from jaxgran.cli.scene import read_scene
 from jaxgran.data.curve_file import ARCHIVE_SUFFIX, CSV_SUFFIXES
-from jaxgran.data.files import check_writable, header_count, header_number, name_in_errors
-from jaxgran.data.header import gas_of_header, guesses_of_header
-from jaxgran.data.scene_file import read_scene_file
+from jaxgran.data.files import check_writable
 from jaxgran.data.tracks import TRACK_KEYS
 from jaxgran.models.checks import check_volume
 from jaxgran.models.choose import NUM_PARTICLES, default_models
-from jaxgran.scene.elements import container_volume_ratio
-from jaxgran.scene.parameters import symbol_of
-
-NUM_POINTS = 50
-"""Number of times of a curve that is computed for --until."""
 
 OF_MEASUREMENTS = (
-    *("T_from", "T_of", "tracked", "T_scale_err", "errors", "T0_of", "t0", "t0_err"),
+    "T_from",
+    "T_of",
+    "tracked",
+    "T_scale_err",
+    "errors",
+    "T0_of",
+    "t0",
+    "t0_err",
     *TRACK_KEYS,
 )
 """Header keys of a measured curve that do not hold for a computed one."""
@@ -96,7 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 @APP.command
-def fit(*curves: Path, options: common.FitOptions | None = None) -> None:
+def fit(*curves: Path, options: FitOptions | None = None) -> None:
     """Estimate the dissipative constant A from one measured cooling curve or several.
 
     Prints a table and a line of JSON; writes a picture and a JSON file.
@@ -107,10 +116,10 @@ def fit(*curves: Path, options: common.FitOptions | None = None) -> None:
             jointly: they share the parameters of the material (A, Y, ...).
     """
     started = time.perf_counter()
-    options = common.FitOptions() if options is None else options
-    common.check_tolerance(options.tolerance)
+    options = FitOptions() if options is None else options
+    check_tolerance(options.tolerance)
     if not options.no_cache:
-        common.use_compilation_cache()
+        use_compilation_cache()
     from jaxgran.cli.fit import run_fit
 
     if not (*curves, *options.drop_test):
@@ -123,8 +132,8 @@ def plan(
     experiment: Path,
     /,
     *,
-    free: Annotated[tuple[common.FreeParameter, ...], common.Several] = (),
-    set: Annotated[tuple[str, ...], common.Several] = (),
+    free: Annotated[tuple[FreeParameter, ...], Several] = (),
+    set: Annotated[tuple[str, ...], Several] = (),
     out: Path | None = None,
     overwrite: bool = False,
     report: bool = False,
@@ -148,7 +157,7 @@ def plan(
         no_cache: Disable the compilation cache (same as JAXGRAN_NO_CACHE=1).
     """
     if not no_cache:
-        common.use_compilation_cache()
+        use_compilation_cache()
     from jaxgran.cli.plan import run_plan
 
     run_plan(experiment, free=free, given=set, out=out, overwrite=overwrite, page=report)
@@ -160,10 +169,10 @@ def cool(
     /,
     *,
     until: float | None = None,
-    model: common.ModelName = "kinetic-theory",
-    particles: common.WholeNumber | None = None,
-    replicas: common.WholeNumber = 1,
-    key: common.WholeNumber = 0,
+    model: ModelName = "kinetic-theory",
+    particles: WholeNumber | None = None,
+    replicas: WholeNumber = 1,
+    key: WholeNumber = 0,
     out: Path = Path("cooling.csv"),
     overwrite: bool = False,
     no_cache: bool = False,
@@ -185,25 +194,24 @@ def cool(
         no_cache: Disable the compilation cache (same as JAXGRAN_NO_CACHE=1).
     """
     if not no_cache:
-        common.use_compilation_cache()
+        use_compilation_cache()
     picture = out.with_suffix(".png")
     if picture == out:
         raise ValueError(f"--out must not end in .png, got {out}. The picture is named after it.")
     if out.suffix not in (ARCHIVE_SUFFIX, *CSV_SUFFIXES):
         raise ValueError(f"--out must end in .csv or .npz, got {out}.")
-    given = _read_scene(scene, until)
+    given = read_scene(scene, until)
     for file in (out, picture):
-        if file.exists() and not overwrite:
-            raise ValueError(f"{file} exists. Name another --out, or add --overwrite.")
+        check_new(file, overwrite)
         check_writable(file)
     from jaxgran import plotting  # needs matplotlib, which `choose` does not need
 
     size = next(n for n in (particles, given.size, NUM_PARTICLES) if n is not None)
-    chosen = common.models_by_name(default_models(size, replicas))[model]
+    chosen = models_by_name(default_models(size, replicas))[model]
     if chosen.stochastic:
         check_volume(given.gas, size)
     curve = jaxgran.cool(given.gas, given.times, model=chosen, key=jax.random.key(key))
-    header = {key: x for key, x in given.header.items() if key not in OF_MEASUREMENTS}
+    header = {name: x for name, x in given.header.items() if name not in OF_MEASUREMENTS}
     if chosen.stochastic:  # a later fit takes its error budget from them
         header |= {"N": str(size), "replicas": str(replicas)}
     jaxgran.write_curve(out, curve, header, overwrite=overwrite)
@@ -211,7 +219,7 @@ def cool(
     title = f"{scene.stem}: {chosen.name}, T falls to {ratio:.3g} of its first value"
     plotting.save_curves({chosen.name: (curve, None)}, title, picture)
     print(f"{model}: T falls to {ratio:.3g} of its first value in {given.times[-1]:.3g} s")
-    print(f"written  {out}\n         {picture}")
+    print(list_written([out, picture]))
 
 
 @APP.command
@@ -233,66 +241,10 @@ def choose(
         tolerance: Allowed relative error of T.
         no_cache: Disable the compilation cache (same as JAXGRAN_NO_CACHE=1).
     """
-    common.check_tolerance(tolerance)
+    check_tolerance(tolerance)
     if not no_cache:
-        common.use_compilation_cache()
-    given = _read_scene(scene, until, fits_A=True)
+        use_compilation_cache()
+    given = read_scene(scene, until, fits_A=True)
     choice = jaxgran.choose_model(given.gas, given.times, tolerance, given.size)
     for reason in choice.reasons:
         print(reason)
-
-
-def _read_scene(path: Path, until: float | None, fits_A: bool = False) -> SimpleNamespace:
-    """Return the gas, the times, N (size) and the header of a scene.
-
-    Args:
-        path: of a TOML file or a curve.
-        until: the last time, s.
-        fits_A: whether A is fitted where a curve has none.
-    """
-    times = None
-    t0 = 0.0
-    if path.suffix == ".toml":
-        with name_in_errors(path):
-            header, _ = read_scene_file(path)
-            gas, questions = gas_of_header(header)
-        for question in questions:
-            warnings.warn(f"{path}: {question}", stacklevel=2)
-    else:
-        measurement = jaxgran.read_measurement(path)
-        header = dict(measurement.header)
-        gas = measurement.gas
-        t0 = header_number({"t0": "0"} | header, "t0")
-        times = measurement.curve.times - t0
-        if not {"A", "eps"} & header.keys() and fits_A:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # on the fit
-                fitted = jaxgran.fit(measurement, quick=True)
-            gas = fitted.gas
-            header["A"] = repr(float(gas.value("dissipative_constant")))
-            print(f"A = {float(header['A']):.4g} s, by a fit of this curve")
-    if not {"A", "eps"} & header.keys():
-        raise ValueError(
-            f"{path} does not give A, in s, or eps, a constant restitution. Add one, or estimate A "
-            "with jaxgran fit."
-        )
-    if guesses := guesses_of_header(header):
-        symbols = ", ".join(map(symbol_of, guesses))
-        raise ValueError(f"{path}: {symbols} is a guess. Give its value.")
-    if until is not None:
-        first = float(gas.mean_free_time) / 10
-        if not first < until < float("inf"):
-            raise ValueError(
-                f"--until must lie above {first:.3g} s (mean free time / 10), got {until:g}"
-            )
-        times = jnp.geomspace(first, until, NUM_POINTS)
-    if times is None:
-        raise ValueError(f"{path} has no times. Give the last one, in s, as --until.")
-    if times[0] < 0:
-        raise ValueError(
-            f"{path}: the gas began at t0 = {t0:g} s, after the first time. Correct t0."
-        )
-    size = header_count(header, "N")
-    if size is None and gas.container is not None:
-        size = round(1 / container_volume_ratio(gas, 1))
-    return SimpleNamespace(gas=gas, times=times, size=size, header=header)

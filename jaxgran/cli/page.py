@@ -10,11 +10,23 @@ from pathlib import Path
 from jaxgran.data.curve import import_extra
 from jaxgran.data.files import write_atomically
 from jaxgran.fitting.plan import Plan
-from jaxgran.fitting.report import BUDGET_PARTS, alternative_rows, parameter_rows
+from jaxgran.fitting.report import (
+    BUDGET_PARTS,
+    ParameterRow,
+    alternative_table,
+    parameter_rows,
+)
 from jaxgran.fitting.result import Fit
 from jaxgran.scene.parameters import symbol_of
 
 TEMPLATE = Path(__file__).with_name("page.html")
+"""The page, in the language of jinja2."""
+
+QUESTIONS = {
+    "fit": "Which {symbol} explains these measurements?",
+    "plan": "Which range of {symbol} will this experiment give, and what would narrow it?",
+}
+"""The question that the page of a command answers."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +48,13 @@ class Section:
 
 
 def write_page(
-    path: Path, title: str, question: str, answer: str, sections: Sequence[Section], command: str
+    path: Path,
+    *,
+    title: str,
+    question: str,
+    answer: str,
+    sections: Sequence[Section],
+    command: str,
 ) -> None:
     """Write a page.
 
@@ -65,38 +83,42 @@ def sections_of_fit(result: Fit, picture: Path | None) -> list[Section]:
     shown = "" if picture is None else _encoded(picture)
     sentences = [text for text in (result.verdict, result.narrowing) if text]
     sections = [Section("The curve and its fit", sentences, picture=shown)]
-    head, rows = alternative_rows(result)
-    if rows:
-        sections.append(Section("Other explanations", head=head, rows=rows))
-    for row in parameter_rows(result):
-        parts = sorted(row["error_budget"].items(), key=lambda part: -part[1])
-        cells = [
-            (name, f"{size:.2g}", BUDGET_PARTS.get(name, "uncertainty of this input"))
-            for name, size in parts
-            if size > 0
-        ]
-        title = f"What the error of {row['parameter']} consists of"
-        of_unit = f"size, {row['unit']}" if row["unit"] else "size"
-        sections.append(Section(title, head=("part", of_unit, "meaning"), rows=cells))
+    alternatives = alternative_table(result)
+    if alternatives.rows:
+        title = "Other explanations"
+        sections.append(Section(title, head=alternatives.head, rows=alternatives.rows))
+    sections += map(_section_of_budget, parameter_rows(result))
     sections.append(Section("Reasons", result.reasons))
     for label, m in result.measurements.items():
-        title = f"The input as it was read{': ' if label else ''}{label}"
+        title = "The input as it was read"
+        title = f"{title}: {label}" if label else title
         sections.append(Section(title, head=("key", "value, SI"), rows=m.header))
     return sections
+
+
+def _section_of_budget(row: ParameterRow) -> Section:
+    """Return the parts of the error of a parameter, the largest first."""
+    cells = [
+        (name, f"{size:.2g}", BUDGET_PARTS.get(name, "uncertainty of this input"))
+        for name, size in row.largest_parts
+    ]
+    title = f"What the error of {row.parameter} consists of"
+    size_in_unit = f"size, {row.unit}" if row.unit else "size"
+    return Section(title, head=("part", size_in_unit, "meaning"), rows=cells)
 
 
 def sections_of_plan(planned: Plan, picture: Path, title: str = "What to measure") -> list[Section]:
     """Return the parts of a page on what to measure."""
     head, rows = planned.table
-    return [Section(title, planned.notes, head, rows, _encoded(picture))]
+    section = Section(
+        title, sentences=planned.notes, head=head, rows=rows, picture=_encoded(picture)
+    )
+    return [section]
 
 
-def question_of(parameter: str, kind: str) -> str:
-    """Return the question that a page answers, in a sentence."""
-    symbol = symbol_of(parameter)
-    if kind == "plan":
-        return f"Which range of {symbol} will this experiment give, and what would narrow it?"
-    return f"Which {symbol} explains these measurements?"
+def question_of(command: str, parameter: str) -> str:
+    """Return the question that the page of a command answers, in a sentence."""
+    return QUESTIONS[command].format(symbol=symbol_of(parameter))
 
 
 def command_of(name: str, files: Sequence[Path]) -> str:

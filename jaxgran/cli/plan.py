@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,13 +11,14 @@ import numpy as np
 import jaxgran
 from jaxgran import plotting
 from jaxgran._utils.tracing import as_jax_arrays
-from jaxgran.cli.fit import as_json, parse_settings
+from jaxgran.cli.options import parse_settings
+from jaxgran.cli.output import as_json, check_new, list_written, title_of
 from jaxgran.cli.page import command_of, question_of, sections_of_plan, write_page
+from jaxgran.cli.scene import has_dissipation, read_toml
 from jaxgran.data.curve import import_extra
 from jaxgran.data.files import check_writable, name_in_errors, write_atomically
-from jaxgran.data.header import gas_of_header
 from jaxgran.data.measurement_file import arguments_of_header
-from jaxgran.data.scene_file import errors_of, read_scene_file, times_of
+from jaxgran.data.scene_file import errors_of, times_of
 from jaxgran.fitting.twins import twin
 
 
@@ -47,30 +47,36 @@ def run_plan(
     record = picture.with_suffix(".json")
     if picture == record:
         raise ValueError(f"--out {out} is the name of the JSON file. Give the picture another one.")
-    written = [picture, record, *([picture.with_suffix(".html")] if page else [])]
+    html = picture.with_suffix(".html")
+    written = [picture, record, html] if page else [picture, record]
     for file in written:
-        if file.exists() and not overwrite:
-            raise ValueError(f"{file} exists. Name another --out, or add --overwrite.")
+        check_new(file, overwrite)
         check_writable(file)
-    if path.suffix == ".toml":
-        if given:
-            raise ValueError("--set replaces values of a CSV file. Write them into the TOML file.")
-        with name_in_errors(path):
-            measurement = read_experiment(path)
-    else:
-        measurement = jaxgran.read_measurement(path, parse_settings(given))
-    planned = jaxgran.plan(measurement, free=tuple(free) or None)
+    planned = jaxgran.plan(_read(path, given), free=tuple(free) or None)
     print(planned)
-    plotting.save_plan(planned, f"{path.stem.replace('_', ' ')}: {planned.headline}", picture)
+    plotting.save_plan(planned, f"{title_of(path)}: {planned.headline}", picture)
     text = json.dumps(as_json(details_of(planned)), indent=1, allow_nan=False) + "\n"
     write_atomically(record, lambda file: file.write(text.encode()))
     if page:
-        sections = sections_of_plan(planned, picture)
-        question = question_of(planned.parameter, "plan")
-        title = path.stem.replace("_", " ")
-        command = command_of("plan", [path])
-        write_page(written[-1], title, question, planned.headline, sections, command)
-    print("\nwritten  " + "\n         ".join(map(str, written)))
+        write_page(
+            html,
+            title=title_of(path),
+            question=question_of("plan", planned.parameter),
+            answer=planned.headline,
+            sections=sections_of_plan(planned, picture),
+            command=command_of("plan", [path]),
+        )
+    print(f"\n{list_written(written)}")
+
+
+def _read(path: Path, given: Sequence[str]) -> jaxgran.Measurement:
+    """Return the planned measurement of a scene, or the measured one of a curve."""
+    if path.suffix != ".toml":
+        return jaxgran.read_measurement(path, parse_settings(given))
+    if given:
+        raise ValueError("--set replaces values of a CSV file. Write them into the TOML file.")
+    with name_in_errors(path):
+        return read_experiment(path)
 
 
 def read_experiment(path: Path) -> jaxgran.Measurement:
@@ -79,18 +85,15 @@ def read_experiment(path: Path) -> jaxgran.Measurement:
     Args:
         path: of a TOML file of a scene with a table [experiment].
     """
-    header, experiment = read_scene_file(path)
-    gas, questions = gas_of_header(header)
-    for question in questions:
-        warnings.warn(f"{path}: {question}", stacklevel=2)
-    if not {"A", "eps"} & header.keys():
+    file = read_toml(path)
+    if not has_dissipation(file.header):
         raise ValueError("a plan needs a guess of A, in s, or of eps: add one")
-    errors = errors_of(experiment)
-    if "rotational_temperature" in errors and gas.surface is None:
+    errors = errors_of(file.experiment)
+    if "rotational_temperature" in errors and file.gas.surface is None:
         raise ValueError("T_rot_err needs rough grains: give beta_t, or leave out T_rot_err")
-    if "displacement" in errors and gas.container is not None:
+    if "displacement" in errors and file.gas.container is not None:
         raise ValueError("msd_err: <dr^2> is not computed between walls. Leave out msd_err")
-    times = times_of(experiment)
+    times = times_of(file.experiment)
     ones = np.ones_like(times)
     planned: dict[str, Any] = {"times": times, "temperature": ones}
     for name, error in errors.items():
@@ -98,16 +101,16 @@ def read_experiment(path: Path) -> jaxgran.Measurement:
         planned[f"{name}_error"] = error * ones
     planned["status"] = np.zeros((), int)
     curve = jaxgran.CoolingCurve(**as_jax_arrays(planned))
-    arguments = arguments_of_header(header)
+    arguments = arguments_of_header(file.header)
     arguments["errors_measured"] |= "temperature" in errors
-    return twin(jaxgran.Measurement(gas, curve, **arguments))
+    return twin(jaxgran.Measurement(file.gas, curve, **arguments))
 
 
 def details_of(planned: jaxgran.Plan) -> dict[str, Any]:
     """Return the content of the JSON file."""
     fields = {f.name: getattr(planned, f.name) for f in dataclasses.fields(planned)}
     del fields["measurement"]
-    rows = [row._asdict() for row in planned.additions]
-    pair = None if planned.pair is None else planned.pair._asdict()
-    more = {"present": planned.present._asdict(), "additions": rows, "pair": pair}
-    return {"headline": planned.headline} | fields | more
+    fields["present"] = planned.present._asdict()
+    fields["additions"] = [row._asdict() for row in planned.additions]
+    fields["pair"] = None if planned.pair is None else planned.pair._asdict()
+    return {"headline": planned.headline} | fields

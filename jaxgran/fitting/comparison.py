@@ -108,32 +108,32 @@ class Comparison:
     def _temperature_residuals(self, size: int) -> Residuals:
         """Return the residuals of T, followed by the residuals of T_rot."""
         moving = _elements_that_change_temperatures(self.curve)
-        found = self._innovations_at_neighbours([tangent for _, tangent in moving])
-        values = found.values
-        variances = found.variances
-        changes = found.density_changes
-        error = np.sqrt(variances[0])
-        whitened = values[0] / error
-        slopes = np.zeros((whitened.size, size))
-        log_slopes = np.zeros((whitened.size, size))
-        for k, (element, _) in enumerate(moving):
-            up = 1 + 2 * k
-            down = 2 + 2 * k
-            of_value = (values[up] - values[down]) / (2 * DIFFERENCE)
-            of_log_variance = np.log(variances[up] / variances[down]) / (2 * DIFFERENCE)
-            of_change = (changes[up] - changes[down]) / (2 * DIFFERENCE)
+        here, *steps = self._innovations_at_neighbours([tangent for _, tangent in moving])
+        error = np.sqrt(here.variances)
+        values = here.values / error
+        slopes = np.zeros((values.size, size))
+        log_slopes = np.zeros((values.size, size))
+        for (element, _), up, down in zip(moving, steps[::2], steps[1::2], strict=True):
+            of_value = (up.values - down.values) / (2 * DIFFERENCE)
+            of_log_variance = np.log(up.variances / down.variances) / (2 * DIFFERENCE)
+            of_change = (up.density_changes - down.density_changes) / (2 * DIFFERENCE)
             # What -2 ln L gains where T is compared in place of ln T is shared between both, so
             # that slopes become the slopes of (y - T)/error there, and log_slopes 0.
-            slopes[:, element.place] = of_value / error + 0.5 * whitened * of_change
+            slopes[:, element.place] = of_value / error + 0.5 * values * of_change
             log_slopes[:, element.place] = of_log_variance + of_change
-        log_variance = np.log(variances[0]) + changes[0]
-        label = self.curve.rows.label
-        return Residuals("curve", label, whitened, slopes, log_variance, log_slopes)
+        return Residuals(
+            name="curve",
+            label=self.curve.rows.label,
+            values=values,
+            slopes=slopes,
+            log_variance=np.log(here.variances) + here.density_changes,
+            log_slopes=log_slopes,
+        )
 
-    def _innovations_at_neighbours(self, tangents: list[Prediction]) -> Innovations:
-        """Return innovations at the unknowns, and a step up and a step down along each tangent.
+    def _innovations_at_neighbours(self, tangents: list[Prediction]) -> list[Innovations]:
+        """Return innovations at the unknowns, then a step up and a step down along each tangent.
 
-        The shapes are (1 + 2 tangents, 2 times): all times of T, then all times of T_rot.
+        Each has the shape (2 times,): all times of T, then all times of T_rot.
         """
         curve = self.curve
         count = 1 + 2 * len(tangents)
@@ -144,6 +144,7 @@ class Comparison:
             steps[k, 2 + 2 * k] = -DIFFERENCE
 
         def with_neighbours(x: Any, *tangents: Any) -> np.ndarray:
+            # The zeros, which are left out again, give the shape if there are no tangents.
             slopes = np.stack([np.zeros_like(x), *tangents], axis=-1)[..., 1:]
             return np.asarray(x)[..., None] + slopes @ steps
 
@@ -167,11 +168,11 @@ class Comparison:
             return np.asarray(x)[curve.place, :, :count].transpose(2, 1, 0).reshape(count, -1)
 
         used = curve.rows.used.T.ravel() > 0
-        return Innovations(
-            of_data(found.values),
-            np.where(used, of_data(found.variances), 1.0),
-            np.where(used, of_data(found.density_changes), 0.0),
-        )
+        values = of_data(found.values)
+        variances = np.where(used, of_data(found.variances), 1.0)
+        density_changes = np.where(used, of_data(found.density_changes), 0.0)
+        rows = zip(values, variances, density_changes, strict=True)
+        return [Innovations(*row) for row in rows]
 
     @property
     def _error_factor(self) -> float:
@@ -196,13 +197,13 @@ class Comparison:
 def _nodes(curve: PredictedCurve, batch: Prediction, gas: Gas) -> Nodes:
     """Return predictions of some gases, which are the last axis of `batch`, as nodes."""
     return Nodes(
-        curve.times,
-        batch.log_T,
-        batch.rotation,
-        curve.sonine,
-        batch.collisions,
-        batch.size_ratio,
-        curve.by_size_ratio(gas, batch.size_ratio),
+        times=curve.times,
+        log_temperature=batch.log_T,
+        rotation=batch.rotation,
+        sonine=curve.sonine,
+        collisions=batch.collisions,
+        size_ratio=batch.size_ratio,
+        by_size_ratio=curve.by_size_ratio(gas, batch.size_ratio),
     )
 
 
@@ -227,9 +228,14 @@ def _displacement_residuals(curve: PredictedCurve, measured: Displacement, size:
         if element.name == DISPLACEMENT:
             change = diffusive * element.slope
         slopes[:, element.place] = -measured.whitening @ np.where(used, change, 0.0)
-    log_variance = np.zeros(values.size)
-    log_slopes = np.zeros_like(slopes)
-    return Residuals("displacement", curve.rows.label, values, slopes, log_variance, log_slopes)
+    return Residuals(
+        name="displacement",
+        label=curve.rows.label,
+        values=values,
+        slopes=slopes,
+        log_variance=np.zeros(values.size),
+        log_slopes=np.zeros_like(slopes),
+    )
 
 
 def _batch_size(count: int) -> int:

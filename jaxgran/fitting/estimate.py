@@ -12,6 +12,7 @@ from jaxgran.data.curve import CoolingCurve, above_noise
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.alternatives import Explanations, compare_alternatives
+from jaxgran.fitting.conclusions import with_conclusions
 from jaxgran.fitting.descent import Descent
 from jaxgran.fitting.goodness import SIGNIFICANCE, goodness, measurement_share
 from jaxgran.fitting.information import (
@@ -23,13 +24,13 @@ from jaxgran.fitting.information import (
     undetermined,
     weights_of_measurements,
 )
-from jaxgran.fitting.messages import say, with_words
+from jaxgran.fitting.messages import Message
 from jaxgran.fitting.outliers import without_outliers
 from jaxgran.fitting.parameters import as_floats, with_parameters
 from jaxgran.fitting.prediction import TINY
 from jaxgran.fitting.problem import Evaluation, Problem, unknown_of
 from jaxgran.fitting.profiles import ALLOWED
-from jaxgran.fitting.result import Fit
+from jaxgran.fitting.result import Fit, by_label
 from jaxgran.fitting.rows import SCATTER, WHITE, CurveRows, has_no_measured_errors
 from jaxgran.fitting.search import Minimum, deepest, minima_from_starts, minimise
 from jaxgran.fitting.setup import Request, build_problem, problem_with_rate_errors
@@ -97,11 +98,11 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
         explanations = compare_alternatives(end.problem, end.minima, noise)
     result = _result(request, end, explanations, quality)
     if distant:
-        notes.append(say("distant", ratio=MAX_DISTANCE))
+        notes.append(str(Message("distant", ratio=MAX_DISTANCE)))
     elif result.p_value < SIGNIFICANCE and not request.quick:
         notes += _outlier_notes(without_errors.problem, first, max_steps)
     if found.scatter_of_eps is not None:
-        notes.append(say("scatter of eps", scatter=found.scatter_of_eps))
+        notes.append(str(Message("scatter of eps", scatter=found.scatter_of_eps)))
     share = measurement_share(end.problem, found)
     return with_messages(request, result, explanations, notes, share)
 
@@ -220,13 +221,14 @@ def _outlier_notes(problem: Problem, first: np.ndarray, max_steps: int) -> list[
         prefix = f"{value.label}: " if value.label else ""
         time = times[value.label][value.time]
         places.append(f"{prefix}t = {time:.3g} s (row {value.time + 1})")
-    without = say(
-        "without outliers",
+    message = Message(
+        "outliers",
+        places=", ".join(places),
         symbol=symbol_of(problem.unknowns[0].name),
         value=rest.estimates(end.flat)[0],
         error=np.sqrt(inverse(found.information)[0, 0]) * rest.slopes(end.flat)[0],
     )
-    return [say("outliers", places=", ".join(places)) + without]
+    return [str(message)]
 
 
 def _result(
@@ -408,7 +410,7 @@ def with_messages(
     """
     limitations: dict[str, Limitation] = {}
     notes = list(notes)
-    gases = result.gas if isinstance(result.gas, dict) else {"": result.gas}
+    gases = by_label(result.gas)
     for label, m in request.measurements.items():
         if isinstance(m.data, DropTest):
             continue
@@ -417,11 +419,11 @@ def with_messages(
         for limitation in request.model.limitations(gas, N):
             limitations.setdefault(limitation.words, limitation)
         if gas.container is not None:
-            notes.append(say("gravity"))
+            notes.append(str(Message("gravity")))
         if N is not None and gas.container is None and "walls" not in m.absent:
-            prefix = f"{label}: " if label else ""
-            notes.append(f"{prefix}the box of {N} spheres {describe_walls(gas, N)}")
-    return with_words(
+            box = Message("box", of=label, number=N, walls=describe_walls(gas, N))
+            notes.append(str(box))
+    return with_conclusions(
         result,
         explanations,
         tuple(limitations.values()),

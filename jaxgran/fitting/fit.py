@@ -1,6 +1,7 @@
 """Fits of the parameters of a gas to one measurement, or to several together."""
 
 import warnings
+from collections.abc import Iterator
 from itertools import permutations
 from typing import Any
 
@@ -13,11 +14,11 @@ from jaxgran._utils.validation import check_bool, checked_int
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import DENSITY, START_TIME, Measurement, Priors
+from jaxgran.fitting.conclusions import describe_search
 from jaxgran.fitting.descent import Descent, is_transformation
 from jaxgran.fitting.estimate import fit_without_noise
 from jaxgran.fitting.learnt_law import describe_unvisited_knots
 from jaxgran.fitting.measured_rows import unused_displacements, unused_rotation
-from jaxgran.fitting.messages import describe_search
 from jaxgran.fitting.parameters import (
     SHARED,
     SMOOTHNESS,
@@ -33,6 +34,7 @@ from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_gas, checked_key, checked_model
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.scene.gas import Gas, law_fields
+from jaxgran.scene.laws import RestitutionLaw
 from jaxgran.scene.parameters import BY_SYMBOL, MATERIAL, PARAMETERS, symbol_of
 
 GRAIN_PARAMETERS = ("diameter", "diameter_sd", DENSITY)
@@ -40,6 +42,20 @@ GRAIN_PARAMETERS = ("diameter", "diameter_sd", DENSITY)
 
 START_TIME_PRIOR = 1.0
 """Standard error of the prior of t0 where T_0 is free too, over the time in which T halves."""
+
+DEFAULT_STEPS = {
+    (False, False): 100,
+    (False, True): 1000,
+    (True, False): 8,
+    (True, True): 100,
+}
+"""Default of `max_steps`, by whether the model is stochastic and whether optax searches."""
+
+HOW_TO_MEASURE = (
+    "Make one by jaxgran.read_measurement(path), or by jaxgran.Measurement(gas, "
+    "jaxgran.CoolingCurve(t, T))"
+)
+"""End of messages on other objects."""
 
 
 def fit(
@@ -122,49 +138,34 @@ def fit(
     '3e-06 s'
     """
     check_bool(progress=progress, throw=throw, quick=quick)
-    measurements = _by_label(measurement)
+    measurements = _checked_measurements(measurement)
     model = KineticTheory() if model is None else model
-    curves = {k: m for k, m in measurements.items() if isinstance(m.data, CoolingCurve)}
-    first = next(iter(curves), next(iter(measurements)))
-    gas = measurements[first].gas
+    first = next(iter(measurements.values()))  # a curve, unless there are drop tests alone
+    gas = first.gas
     separate = _names(separate, gas)
-    names = _names(free, gas)
     if free is None:
-        names = tuple(x for x in free_by_default(measurements[first]) if x not in separate)
-    _check_request(measurements, names, separate)
+        defaults = free_by_default(first)
+        names = tuple(name for name in defaults if name not in separate)
+    else:
+        names = _names(free, gas)
+    _check_free(measurements, names, separate)
     if max_steps is not None:
         checked_int("max_steps", max_steps, 1)
     key = checked_key(key)
     priors = _priors_by_label(measurements)
-    law = gas.law
-    if law.prior_residuals().size and not {*names}.isdisjoint(law_fields(law)):
-        if getattr(model, "stochastic", False) and solver is None:
-            raise ValueError(
-                f"a smoothness prior, which {type(law).__name__} has, needs KineticTheory() or a "
-                f"solver of optax, as optax.adam(0.05), got {type(model).__name__} without solver"
-            )
-        smooth = {SMOOTHNESS: (jnp.asarray(0.0), jnp.asarray(1.0))}
-        priors[SHARED] = priors.get(SHARED, {}) | smooth
-    for m in curves.values():
-        for unused in (unused_rotation(m), unused_displacements(m)):
-            if unused is not None:
-                warnings.warn(unused, stacklevel=2)
-    shared = priors.get(SHARED, {})
-    _check_model(model, solver, (*names, *separate), shared, gas, curves)
-    known = {name for some in priors.values() for name in some}
-    if {START_TIME, "temperature"} <= {*names, *separate} - known:
-        for label in curves if START_TIME in separate else [SHARED]:
-            width = START_TIME_PRIOR * float(halving_time(curves[label or first].curve))
-            start_time = {START_TIME: (jnp.asarray(0.0), jnp.asarray(width))}
-            priors[label] = priors.get(label, {}) | start_time
-    if both := [name for name in separate if name in priors.get(SHARED, {})]:
-        raise ValueError(
-            f"{both[0]} is fitted separately for each curve, and the curves have one common prior "
-            "of it: free it for all, or leave its error out of the headers"
-        )
+    if _is_smoothed(gas.law, names):
+        _check_smoothed(gas.law, model, solver)
+        priors = _with_prior(priors, SHARED, SMOOTHNESS, 1.0)
+    for text in _unused_columns(measurements):
+        warnings.warn(text, stacklevel=2)
+    _check_solver(solver)
+    _check_model(model, (*names, *separate), priors.get(SHARED, {}), measurements)
+    for label, width in _widths_of_start_time(measurements, names, separate, priors).items():
+        priors = _with_prior(priors, label, START_TIME, width)
+    _check_priors(priors, separate)
     if model.stochastic:  # of one curve, whose parameters are all its own
-        names, separate = (*names, *separate), ()
-    descent = None if solver is None else Descent(solver, progress, throw)
+        names = (*names, *separate)
+        separate = ()
     request = Request(
         measurements=measurements,
         model=model,
@@ -174,37 +175,26 @@ def fit(
         start=start,
         quick=quick,
     )
+    descent = None if solver is None else Descent(solver, progress, throw)
+    if max_steps is None:
+        max_steps = DEFAULT_STEPS[bool(model.stochastic), descent is not None]
     if model.stochastic:
-        steps = (8 if descent is None else 100) if max_steps is None else max_steps
         key = jax.random.key(0) if key is None else key
-        result = fit_through_simulations(request, key, progress, steps, descent)
+        result = fit_through_simulations(request, key, progress, max_steps, descent)
     else:
-        steps = (100 if descent is None else 1000) if max_steps is None else max_steps
-        result = fit_without_noise(request, steps, descent)
-    for clause in (*describe_unvisited_knots(result), *describe_search(result)):
-        warnings.warn(clause, stacklevel=2)
-    if jnp.result_type(float) == jnp.float32:
-        warnings.warn(
-            "fitting in float32: relative errors below 1e-4 are round-off. Call "
-            'jax.config.update("jax_enable_x64", True) first',
-            stacklevel=2,
-        )
-    if model.stochastic and len(result.estimate) > MAX_LINEARISED:
-        warnings.warn(
-            f"no errors are given of {len(result.estimate)} parameters fitted through "
-            f"{type(model).__name__}: judge them by several fits with other keys",
-            stacklevel=2,
-        )
+        result = fit_without_noise(request, max_steps, descent)
+    for text in _warnings(result, model):
+        warnings.warn(text, stacklevel=2)
     return result
 
 
-def _by_label(measurement: Any) -> dict[str, Measurement]:
+def _checked_measurements(measurement: Any) -> dict[str, Measurement]:
     """Return measurements by label, drop tests last; the label of a single measurement is ""."""
     if isinstance(measurement, Measurement):
         return {"": measurement}
     if not isinstance(measurement, dict):
         raise ValueError(
-            f"expected a jaxgran.Measurement, got {_kind(measurement)}. {HOW_TO_MEASURE}"
+            f"expected a jaxgran.Measurement, got a {type(measurement).__name__}. {HOW_TO_MEASURE}"
         )
     if not measurement:
         raise ValueError("no measurement is given: give one or more, as {'first': measurement}")
@@ -213,7 +203,8 @@ def _by_label(measurement: Any) -> dict[str, Measurement]:
             raise ValueError(f'labels of measurements are texts without ": ", got {label!r}')
         if not isinstance(value, Measurement):
             raise ValueError(
-                f"{label!r} must be a jaxgran.Measurement, got {_kind(value)}. {HOW_TO_MEASURE}"
+                f"{label!r} must be a jaxgran.Measurement, got a {type(value).__name__}. "
+                f"{HOW_TO_MEASURE}"
             )
     _check_no_copies(measurement)
     # Curves come first: their gases have the parameters that drop tests do not depend on.
@@ -243,19 +234,8 @@ def _rows_of(data: CoolingCurve | DropTest) -> set[tuple[str, ...]]:
     return {tuple(f"{x:.6g}" for x in row) for row in rows}
 
 
-HOW_TO_MEASURE = (
-    "Make one by jaxgran.read_measurement(path), or by jaxgran.Measurement(gas, "
-    "jaxgran.CoolingCurve(t, T))"
-)
-"""End of messages on other objects."""
-
-
-def _kind(value: Any) -> str:
-    return f"a {type(value).__name__}"
-
-
 def _names(names: Any, gas: Gas) -> tuple[str, ...]:
-    """Return names of parameters: `LAW` and symbols of files are replaced by them."""
+    """Return names of parameters in place of symbols of files, and of "law"."""
     names = () if names is None else names
     names = (names,) if isinstance(names, str) else names
     if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names):
@@ -265,6 +245,54 @@ def _names(names: Any, gas: Gas) -> tuple[str, ...]:
         BY_SYMBOL[name].name if name in BY_SYMBOL and name not in known else name for name in names
     ]
     return with_names_of_law(tuple(names), gas)
+
+
+def free_by_default(measurement: Measurement) -> tuple[str, ...]:
+    """Return A, or a constant restitution, and T_0 if the errors of T are not known."""
+    gas = measurement.gas
+    constants = [name for name in ("dissipative_constant", "coefficient") if name in gas.domains]
+    if not constants:
+        raise ValueError(
+            f"the law {type(gas.law).__name__} has neither A nor a constant coefficient: give "
+            f"free, names among {', '.join(gas.domains)}"
+        )
+    data = measurement.data
+    is_bare = isinstance(data, CoolingCurve) and data.temperature_error is None
+    return (constants[0], "temperature") if is_bare else (constants[0],)
+
+
+def _check_free(
+    measurements: dict[str, Measurement], free: tuple[str, ...], separate: tuple[str, ...]
+) -> None:
+    """Raise ValueError unless free and separate are names of different parameters."""
+    if not free or len(set(free)) < len(free):
+        raise ValueError(f"free must be a tuple of different names, got {free!r}")
+    names = (*free, *separate)
+    if len(set(names)) < len(names) or (START_TIME in free and len(measurements) > 1):
+        raise ValueError(
+            f"free and separate must be different names, got {free} and {separate}; of several "
+            f"measurements each has its own {START_TIME}: put it into separate"
+        )
+    for label, m in measurements.items():
+        # Spheres of drop tests beside curves need not have the elements of the curves.
+        if not isinstance(m.data, DropTest) or len(measurements) == 1:
+            _check_free_of(label, m, names)
+
+
+def _check_free_of(label: str, m: Measurement, names: tuple[str, ...]) -> None:
+    """Raise ValueError unless a measurement has all free parameters, and no other guess."""
+    for name in names:
+        try:
+            domain_of(m.gas, name)
+        except ValueError as error:
+            symbol = symbol_of(name)
+            hint = f". Give the header line `# {symbol}: guess`" if symbol in BY_SYMBOL else ""
+            raise ValueError(f"{error}{hint}") from None
+    if missing := [symbol_of(name) for name in m.guesses if name not in names]:
+        place = f" of {label!r}" if label else ""
+        raise ValueError(
+            f"the value{place} of {missing[0]} is a guess: free it, too, or give its value"
+        )
 
 
 def _priors_by_label(measurements: dict[str, Measurement]) -> dict[str, Priors]:
@@ -277,9 +305,9 @@ def _priors_by_label(measurements: dict[str, Measurement]) -> dict[str, Priors]:
     of_grains = _common_to_all_grains(measurements)
     for label, m in measurements.items():
         for name, pair in m.priors.items():
-            own = name not in PARAMETERS or PARAMETERS[name].belongs_to != MATERIAL
-            own = (own or name == DENSITY) and name not in of_grains
-            place = label if own else SHARED
+            of_material = name in PARAMETERS and PARAMETERS[name].belongs_to == MATERIAL
+            is_shared = (of_material and name != DENSITY) or name in of_grains
+            place = SHARED if is_shared else label
             known = parts.setdefault(place, {}).setdefault(name, pair)
             if not all(np.array_equal(x, y) for x, y in zip(known, pair, strict=True)):
                 raise ValueError(
@@ -304,67 +332,64 @@ def _common_to_all_grains(measurements: dict[str, Measurement]) -> set[str]:
     return {name for name in GRAIN_PARAMETERS if is_common(name)}
 
 
-def free_by_default(measurement: Measurement) -> tuple[str, ...]:
-    """Return A, or a constant restitution, and T_0 if the errors of T are not known."""
-    gas = measurement.gas
-    constants = [name for name in ("dissipative_constant", "coefficient") if name in gas.domains]
-    if not constants:
+def _with_prior(
+    priors: dict[str, Priors], label: str, name: str, width: float
+) -> dict[str, Priors]:
+    """Return priors with a further one, of mean 0."""
+    prior = (jnp.asarray(0.0), jnp.asarray(width))
+    return priors | {label: priors.get(label, {}) | {name: prior}}
+
+
+def _is_smoothed(law: RestitutionLaw, names: tuple[str, ...]) -> bool:
+    """Tell whether a law has a prior of its own on parameters that are free."""
+    return bool(law.prior_residuals().size) and not {*names}.isdisjoint(law_fields(law))
+
+
+def _check_smoothed(law: RestitutionLaw, model: Any, solver: Any) -> None:
+    """Raise ValueError if the prior of a law is not supported by the search."""
+    if getattr(model, "stochastic", False) and solver is None:
         raise ValueError(
-            f"the law {type(gas.law).__name__} has neither A nor a constant coefficient: give "
-            f"free, names among {', '.join(gas.domains)}"
+            f"a smoothness prior, which {type(law).__name__} has, needs KineticTheory() or a "
+            f"solver of optax, as optax.adam(0.05), got {type(model).__name__} without solver"
         )
-    data = measurement.data
-    is_bare = isinstance(data, CoolingCurve) and data.temperature_error is None
-    return (constants[0], "temperature") if is_bare else (constants[0],)
 
 
-def _check_request(
-    measurements: dict[str, Measurement], free: tuple[str, ...], separate: tuple[str, ...]
-) -> None:
-    """Raise ValueError unless free and separate are names of different parameters."""
-    if not free or len(set(free)) < len(free):
-        raise ValueError(f"free must be a tuple of different names, got {free!r}")
-    names = (*free, *separate)
-    if len(set(names)) < len(names) or (START_TIME in free and len(measurements) > 1):
-        raise ValueError(
-            f"free and separate must be different names, got {free} and {separate}; of several "
-            f"measurements each has its own {START_TIME}: put it into separate"
-        )
-    for label, m in measurements.items():
-        if isinstance(m.data, DropTest) and len(measurements) > 1:
-            continue  # its spheres need not have the elements of the curves
-        for name in names:
-            try:
-                domain_of(m.gas, name)
-            except ValueError as error:
-                symbol = symbol_of(name)
-                hint = f". Give the header line `# {symbol}: guess`" if symbol in BY_SYMBOL else ""
-                raise ValueError(f"{error}{hint}") from None
-        if missing := [symbol_of(name) for name in m.guesses if name not in names]:
-            place = f" of {label!r}" if label else ""
-            raise ValueError(
-                f"the value{place} of {missing[0]} is a guess: free it, too, or give its value"
-            )
+def _curves(measurements: dict[str, Measurement]) -> dict[str, Measurement]:
+    return {label: m for label, m in measurements.items() if isinstance(m.data, CoolingCurve)}
 
 
-def _check_model(
-    model: Any,
-    solver: Any,
-    names: tuple[str, ...],
-    priors: Priors,
-    gas: Gas,
-    curves: dict[str, Measurement],
-) -> None:
-    """Raise ValueError unless a solver can fit a model to measurements."""
+def _unused_columns(measurements: dict[str, Measurement]) -> Iterator[str]:
+    """Yield warnings about measured values that the fit does not use."""
+    for m in _curves(measurements).values():
+        for unused in (unused_rotation(m), unused_displacements(m)):
+            if unused is not None:
+                yield unused
+
+
+def _check_solver(solver: Any) -> None:
+    """Raise ValueError unless a solver is a gradient transformation, or None."""
     if not (solver is None or is_transformation(solver)):
         raise ValueError(
             "solver must be a gradient transformation of optax, such as optax.adam(0.05), or left "
             f"out, got {solver!r:.60}"
         )
-    checked_gas(gas)
+
+
+def _check_model(
+    model: Any, names: tuple[str, ...], priors: Priors, measurements: dict[str, Measurement]
+) -> None:
+    """Raise ValueError unless a model can be fitted to measurements.
+
+    Args:
+        model: of the user.
+        names: of all free parameters.
+        priors: of shared parameters.
+        measurements: by label.
+    """
+    checked_gas(next(iter(measurements.values())).gas)
     name = type(checked_model(model)).__name__
-    needs_start_time = START_TIME in {*names, *priors}
-    if needs_start_time and not curves:
+    curves = _curves(measurements)
+    if START_TIME in {*names, *priors} and not curves:
         raise ValueError(f"{START_TIME} needs a cooling curve, and there are drop tests alone")
     if model.stochastic:
         if [*curves] != [""]:
@@ -372,35 +397,88 @@ def _check_model(
                 "several measurements and drop tests are fitted by a model without noise, got "
                 f"{name}. Use jaxgran.KineticTheory(), or fit the curves one by one"
             )
-        if not np.all(np.asarray(curves[""].curve.temperature) > 0):
-            raise ValueError(
-                f"T below 0 is compared by kinetic theory only, got {name}. Fit the curve up to "
-                "where T falls below some T_err"
-            )
-        T_rot = curves[""].curve.rotational_temperature
-        if gas.surface is not None and T_rot is not None and not np.all(np.asarray(T_rot) > 0):
-            raise ValueError(
-                f"T_rot of 0 or less is compared by kinetic theory only, got {name}. Leave the "
-                "column out, or the times at which T_rot is not above 0"
-            )
-        if needs_start_time:
-            raise ValueError(
-                f"{START_TIME} is fitted through kinetic theory only, got {name}. Fit it by "
-                "kinetic theory, subtract it from the times, and leave it out of free and priors"
-            )
-        if priors and "friction" in gas.elements:
-            raise ValueError(
-                f"priors with {name} are propagated by kinetic theory, which does not support "
-                "friction. Leave priors out, or add those parameters to free"
-            )
-        if both := [x for x in priors if x in names]:
-            raise ValueError(
-                f"{both[0]} is in free and in priors, which a stochastic model does not support: "
-                f"leave {both[0]} out of free (its prior then widens the errors) or out of priors"
-            )
-        replicas = getattr(model, "replicas", None)
-        if isinstance(replicas, int) and replicas < 2:
-            raise ValueError(
-                f"a fit through {name} needs replicas >= 2 to estimate its noise, got {replicas}"
-            )
+        _check_simulated(model, names, priors, curves[""])
     model.check_fit(names)
+
+
+def _check_simulated(
+    model: AbstractModel, names: tuple[str, ...], priors: Priors, measurement: Measurement
+) -> None:
+    """Raise ValueError unless a curve can be fitted through simulations."""
+    name = type(model).__name__
+    gas = measurement.gas
+    if not np.all(np.asarray(measurement.curve.temperature) > 0):
+        raise ValueError(
+            f"T below 0 is compared by kinetic theory only, got {name}. Fit the curve up to "
+            "where T falls below some T_err"
+        )
+    T_rot = measurement.curve.rotational_temperature
+    if gas.surface is not None and T_rot is not None and not np.all(np.asarray(T_rot) > 0):
+        raise ValueError(
+            f"T_rot of 0 or less is compared by kinetic theory only, got {name}. Leave the "
+            "column out, or the times at which T_rot is not above 0"
+        )
+    if START_TIME in {*names, *priors}:
+        raise ValueError(
+            f"{START_TIME} is fitted through kinetic theory only, got {name}. Fit it by "
+            "kinetic theory, subtract it from the times, and leave it out of free and priors"
+        )
+    if priors and "friction" in gas.elements:
+        raise ValueError(
+            f"priors with {name} are propagated by kinetic theory, which does not support "
+            "friction. Leave priors out, or add those parameters to free"
+        )
+    if both := [x for x in priors if x in names]:
+        raise ValueError(
+            f"{both[0]} is in free and in priors, which a stochastic model does not support: "
+            f"leave {both[0]} out of free (its prior then widens the errors) or out of priors"
+        )
+    replicas = getattr(model, "replicas", None)
+    if isinstance(replicas, int) and replicas < 2:
+        raise ValueError(
+            f"a fit through {name} needs replicas >= 2 to estimate its noise, got {replicas}"
+        )
+
+
+def _widths_of_start_time(
+    measurements: dict[str, Measurement],
+    free: tuple[str, ...],
+    separate: tuple[str, ...],
+    priors: dict[str, Priors],
+) -> dict[str, float]:
+    """Return standard errors of t0, by label, where T_0 is free too and neither is known."""
+    known = {name for some in priors.values() for name in some}
+    if not {START_TIME, "temperature"} <= {*free, *separate} - known:
+        return {}
+    curves = _curves(measurements)
+    first = next(iter(curves))
+    labels = curves if START_TIME in separate else [SHARED]
+    return {
+        label: START_TIME_PRIOR * float(halving_time(curves[label or first].curve))
+        for label in labels
+    }
+
+
+def _check_priors(priors: dict[str, Priors], separate: tuple[str, ...]) -> None:
+    """Raise ValueError if a parameter that curves have separately has a common prior."""
+    if both := [name for name in separate if name in priors.get(SHARED, {})]:
+        raise ValueError(
+            f"{both[0]} is fitted separately for each curve, and the curves have one common prior "
+            "of it: free it for all, or leave its error out of the headers"
+        )
+
+
+def _warnings(result: Fit, model: AbstractModel) -> Iterator[str]:
+    """Yield what a user should know before the result is used."""
+    yield from describe_unvisited_knots(result)
+    yield from map(str, describe_search(result))
+    if jnp.result_type(float) == jnp.float32:
+        yield (
+            "fitting in float32: relative errors below 1e-4 are round-off. Call "
+            'jax.config.update("jax_enable_x64", True) first'
+        )
+    if model.stochastic and len(result.estimate) > MAX_LINEARISED:
+        yield (
+            f"no errors are given of {len(result.estimate)} parameters fitted through "
+            f"{type(model).__name__}: judge them by several fits with other keys"
+        )

@@ -1,13 +1,15 @@
 """The report of a fit as text: ranges, estimates, error budget, alternatives, reasons."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxgran.data.curve import above_noise
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.header import GUESS
+from jaxgran.data.measurement import Measurement
+from jaxgran.fitting.alternatives import Alternative
 from jaxgran.fitting.goodness import SIGNIFICANCE
 from jaxgran.fitting.result import CONDITIONAL, Fit
 from jaxgran.scene.parameters import symbol_of, unit_of
@@ -24,6 +26,83 @@ BUDGET_PARTS = {
 }
 """Meaning of the parts of the error budget; other parts have the name of what is uncertain."""
 
+LINES = {
+    "drops": "drops    {name}{number} impacts, v = {low:.3g} .. {high:.3g} m/s",
+    "oblique": "         oblique, {low:.2g} .. {high:.2g} degrees from the normal",
+    "source": "         {source}",
+    "shared grains": "         they share grains with T(t), and hardly errors",
+    "curve": "curve    {name}{number} points, t = {first:.6g} .. {last:.6g} s,",
+    "T falls": "         T falls to {ratio:.3g} of its first value",
+    "gas": "gas      phi = {phi:.3g}, tau_c = {tau_c:.3g} s, t_c/tau_c = {contact_fraction:.2g} "
+    "(fitted)",
+    "viscoelastic gas": "gas      phi = {phi:.3g}, tau_c = {tau_c:.3g} s, t_c/tau_c = "
+    "{contact_fraction:.2g}, beta_T0 = {beta:.3g} (fitted)",
+    "impacts": "impacts  eps = {eps_first:.3g} at the thermal speed of t = 0, {eps_last:.3g} at "
+    "the last one;",
+    "free path": "         mean free path {path:.3g} mm",
+    "free path in box": "         mean free path {path:.3g} mm, in a box of {side:.3g} mm if it is "
+    "a {shape}",
+    "A and Y": "         short contacts depend on A Y^(2/5) only: 10 % in Y is 4 % in A",
+    "model": "model    {model}, {number} steps of the search",
+    "stochastic model": "model    {model}, {number} simulations",
+    "agree": "The measurements do not contradict each other (p = {p:.2g}).",
+    "contradict": "The measurements contradict each other, or the model (p = {p:.2g}).",
+    "reason": "  - {reason}",
+    "budget": "error of {symbol}: {parts}",
+    "budget table": "error of {symbol}, in {words}; the squares of the parts add up",
+    "budget row": "  {share:8.2g}  {name}: {meaning}",
+    "other part": "uncertainty of this input, as given or as known",
+}
+"""Lines of the report by name, with places for values."""
+
+SHAPES = {2: "square", 3: "cube"}
+"""Shape of a box with equal sides, by its dimension."""
+
+
+def _line(name: str, /, **values: Any) -> str:
+    return LINES[name].format(**values)
+
+
+class ParameterRow(NamedTuple):
+    """A free parameter in the report.
+
+    Attributes:
+        parameter: its symbol.
+        unit: SI.
+        estimate: nan if the data do not determine it.
+        std_err: standard error of the estimate.
+        error_budget: the parts of the standard error.
+        low, high: 95 % range over all alternatives; nan if they were not compared.
+        header: its value in the file; None if the file has none.
+    """
+
+    parameter: str
+    unit: str
+    estimate: float
+    std_err: float
+    error_budget: dict[str, float]
+    low: float
+    high: float
+    header: float | None
+
+    @property
+    def largest_parts(self) -> list[tuple[str, float]]:
+        """The parts of the error that are not 0, the largest first."""
+        parts = sorted(self.error_budget.items(), key=lambda part: -part[1])
+        return [(name, size) for name, size in parts if size > 0]
+
+
+class Table(NamedTuple):
+    """A table of texts.
+
+    Attributes:
+        head: of the columns.
+        rows: a text for each column.
+    """
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
 
 def report(result: Fit, *, explain: bool = False) -> str:
     """Return the report of a fit, as the command ``jaxgran fit`` prints it.
@@ -34,44 +113,50 @@ def report(result: Fit, *, explain: bool = False) -> str:
     """
     rows = parameter_rows(result)
     lines = [text for text in (result.headline, result.narrowing, result.verdict) if text]
-    for label in result.measurements:
-        lines += _scene(result, label)
-    kind = "simulations" if "simulation" in result.covariances else "steps of the search"
-    lines.append(f"model    {result.model_name}, {result.iterations} {kind}")
+    for label, measurement in result.measurements.items():
+        lines.append("")
+        if isinstance(measurement.data, DropTest):
+            lines += _drop_test(label, measurement, measurement.data)
+        else:
+            lines += _curve(label, measurement)
+            lines += _gas(measurement, result.scales[label])
+    kind = "stochastic model" if "simulation" in result.covariances else "model"
+    lines.append(_line(kind, model=result.model_name, number=result.iterations))
     lines += ["", *_parameters(rows)]
-    lines += _budget(rows, explain)
-    lines += _alternatives(result)
+    for row in rows:
+        if not np.isnan(row.estimate):
+            lines += _budget_table(row) if explain else [_budget(row)]
+    alternatives = alternative_table(result)
+    if alternatives.rows:
+        lines += ["", *table(*alternatives)]
     if len(result.measurements) > 1:
-        agreement = "do not contradict each other"
-        if result.p_value < SIGNIFICANCE:
-            agreement = "contradict each other, or the model"
-        lines += ["", f"The measurements {agreement} (p = {result.p_value:.2g})."]
-    lines += ["", *(f"  - {reason}" for reason in result.reasons)]
+        agreement = "contradict" if result.p_value < SIGNIFICANCE else "agree"
+        lines += ["", _line(agreement, p=result.p_value)]
+    lines += ["", *(_line("reason", reason=reason) for reason in result.reasons)]
     return "\n".join(lines)
 
 
-def parameter_rows(result: Fit) -> list[dict[str, Any]]:
+def parameter_rows(result: Fit) -> list[ParameterRow]:
     """Return estimate, errors, range and value in the file of each free parameter."""
     rows = []
-    for name in result.names:
+    for i, name in enumerate(result.names):
         estimate, error = (float(np.squeeze(x)) for x in result.value(name))
         if name in result.undetermined:
-            estimate = error = float("nan")
+            estimate = float("nan")
+            error = float("nan")
         ends = result.ranges.get(name, (np.nan, np.nan))
         low, high = (float(np.squeeze(x)) for x in ends)
-        i = result.names.index(name)
-        rows.append(
-            {
-                "parameter": symbol_of(name),
-                "unit": unit_of(name),
-                "estimate": estimate,
-                "std_err": error,
-                "error_budget": {part: float(x[i]) for part, x in result.error_budget.items()},
-                "low": low,
-                "high": high,
-                "header": _in_file(result, name),
-            }
+        row = ParameterRow(
+            parameter=symbol_of(name),
+            unit=unit_of(name),
+            estimate=estimate,
+            std_err=error,
+            error_budget={part: float(x[i]) for part, x in result.error_budget.items()},
+            low=low,
+            high=high,
+            header=_in_file(result, name),
         )
+        rows.append(row)
     return rows
 
 
@@ -83,6 +168,29 @@ def _in_file(result: Fit, name: str) -> float | None:
     return None if text == GUESS else float(text)
 
 
+def alternative_table(result: Fit) -> Table:
+    """Return the alternatives, with the values of the first parameter."""
+    symbol = symbol_of(result.names[0])
+    head = ("alternative explanation", "-2 ln L drop", symbol, "95 %", "distinguishable")
+    rows = []
+    for x in result.alternatives:
+        limits = f"{x.low[0]:.3g} .. {x.high[0]:.3g}"
+        if x.restitution is not None:
+            limits = f"none: eps = {x.restitution:.3g}"
+        answer = _is_distinguishable(x)
+        rows.append((x.name, f"{x.improvement:.2g}", f"{x.estimate[0]:.3g}", limits, answer))
+    return Table(head, rows)
+
+
+def _is_distinguishable(x: Alternative) -> str:
+    """Return whether the data exclude an alternative, in a cell of a table."""
+    if x.preferred:
+        return "preferred by the data"
+    if x.distinguishable:
+        return "yes"
+    return f"no (needs {x.error_reduction_needed:.2g}x smaller errors)"
+
+
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
     """Yield rows of columns below their heads, the first one aligned to the left."""
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
@@ -91,110 +199,98 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
         yield "  ".join([row[0].ljust(widths[0]), *cells[1:]]).rstrip()
 
 
-def _scene(result: Fit, label: str) -> Iterator[str]:
-    """Yield lines on a curve, the gas that was fitted to it, and its impacts; or a drop test."""
-    measurement = result.measurements[label]
-    name = f"{label}: " if label else ""
-    yield ""
-    if isinstance(measurement.data, DropTest):
-        v = np.asarray(measurement.data.speed)
-        yield f"drops    {name}{v.size} impacts, v = {v.min():.3g} .. {v.max():.3g} m/s"
-        if measurement.data.is_oblique:
-            tilt = np.degrees(np.arctan2(np.asarray(measurement.data.tangential_speed), v))
-            yield f"         oblique, {tilt.min():.2g} .. {tilt.max():.2g} degrees from the normal"
-        origin = dict(measurement.header).get("impacts_from")
-        if origin is not None:
-            yield f"         {origin}"
-            yield "         they share grains with T(t), and hardly errors"
-        return
-    T = np.asarray(measurement.data.temperature)
-    last = T[above_noise(measurement.data)][-1]
-    times = np.asarray(measurement.data.times)
-    yield f"curve    {name}{T.size} points, t = {times[0]:.6g} .. {times[-1]:.6g} s,"
-    yield f"         T falls to {last / T[0]:.3g} of its first value"
+def _drop_test(label: str, measurement: Measurement, data: DropTest) -> Iterator[str]:
+    v = np.asarray(data.speed)
+    yield _line("drops", name=_name(label), number=v.size, low=v.min(), high=v.max())
+    if data.is_oblique:
+        tilt = np.degrees(np.arctan2(np.asarray(data.tangential_speed), v))
+        yield _line("oblique", low=tilt.min(), high=tilt.max())
+    header = dict(measurement.header)
+    if "impacts_from" in header:
+        yield _line("source", source=header["impacts_from"])
+        yield _line("shared grains")
+
+
+def _name(label: str) -> str:
+    return f"{label}: " if label else ""
+
+
+def _curve(label: str, measurement: Measurement) -> Iterator[str]:
+    T = np.asarray(measurement.curve.temperature)
+    times = np.asarray(measurement.curve.times)
+    yield _line("curve", name=_name(label), number=T.size, first=times[0], last=times[-1])
+    coolest = T[above_noise(measurement.curve)][-1]
+    yield _line("T falls", ratio=coolest / T[0])
     header = dict(measurement.header)
     if "T_from" in header:
-        yield f"         {header['T_from']}"
-    scales = result.scales[label]
-    beta = f", beta_T0 = {scales['beta']:.3g}" if "beta" in scales else ""
-    yield (
-        f"gas      phi = {scales['phi']:.3g}, tau_c = {scales['tau_c']:.3g} s, "
-        f"t_c/tau_c = {scales['contact_fraction']:.2g}{beta} (fitted)"
-    )
-    yield (
-        f"impacts  eps = {scales['eps_first']:.3g} at the thermal speed of t = 0, "
-        f"{scales['eps_last']:.3g} at the last one;"
-    )
-    box = ""
-    if measurement.num_particles is not None:
-        shape = "cube" if measurement.gas.dimension == 3 else "square"
-        box = f", in a box of {1e3 * scales['side']:.3g} mm if it is a {shape}"
-    yield f"         mean free path {1e3 * scales['mean_free_path']:.3g} mm{box}"
-    if beta:
-        yield "         short contacts depend on A Y^(2/5) only: 10 % in Y is 4 % in A"
+        yield _line("source", source=header["T_from"])
 
 
-def _parameters(rows: list[dict[str, Any]]) -> Iterator[str]:
+def _gas(measurement: Measurement, scales: dict[str, float]) -> Iterator[str]:
+    """Yield lines on a fitted gas, given the numbers that describe it (`Fit.scales`)."""
+    is_viscoelastic = "beta" in scales
+    yield _line("viscoelastic gas" if is_viscoelastic else "gas", **scales)
+    yield _line("impacts", **scales)
+    path = 1e3 * scales["mean_free_path"]
+    if measurement.num_particles is None:
+        yield _line("free path", path=path)
+    else:
+        shape = SHAPES[measurement.gas.dimension]
+        yield _line("free path in box", path=path, side=1e3 * scales["side"], shape=shape)
+    if is_viscoelastic:
+        yield _line("A and Y")
+
+
+def _parameters(rows: list[ParameterRow]) -> Iterator[str]:
     """Yield the table of the ranges and the estimates."""
     cells = []
     for row in rows:
-        low = row["low"]
-        high = row["high"]
-        estimate = row["estimate"]
-        value = f"{estimate:.5g} +- {row['std_err']:.2g}"
-        value += " (rejected)" if estimate < low or estimate > high else ""
-        difference = f"{row['header']:.5g}" if row["header"] else ""
-        if difference and not np.isnan(estimate):
-            difference += f" ({100 * (estimate / row['header'] - 1):+.2f} %)"
-        cells.append(
-            (
-                f"{row['parameter']:3} {row['unit']}",
-                "not computed" if np.isnan(low) else f"{low:.3g} .. {high:.3g}",
-                "not determined" if np.isnan(estimate) else value,
-                difference,
-            )
-        )
+        name = f"{row.parameter:3} {row.unit}"
+        span = "not computed" if np.isnan(row.low) else f"{row.low:.3g} .. {row.high:.3g}"
+        cells.append((name, span, _estimate(row), _value_in_file(row)))
     yield from table(("", "95 % incl. alternatives", CONDITIONAL, "in file"), cells)
 
 
-def _budget(rows: list[dict[str, Any]], explain: bool) -> Iterator[str]:
-    """Yield the parts of each error, the largest first, in per cent of the estimate (t0: in ms)."""
-    for row in rows:
-        if np.isnan(row["estimate"]):
-            continue
-        parts = sorted(row["error_budget"].items(), key=lambda part: -part[1])
-        is_time = row["parameter"].endswith("t0")  # which may be 0
-        scale, unit = (1e-3, "ms") if is_time else (abs(row["estimate"]) / 100, "%")
-        shares = [(name, x / scale) for name, x in parts if x > 0]
-        if not explain:
-            line = ", ".join(f"{name} {share:.2g} {unit}" for name, share in shares)
-            yield f"error of {row['parameter']}: {line}"
-            continue
-        words = "ms" if is_time else "per cent"
-        yield ""
-        yield f"error of {row['parameter']}, in {words}; the squares of the parts add up"
-        for name, share in shares:
-            meaning = BUDGET_PARTS.get(name, "uncertainty of this input, as given or as known")
-            yield f"  {share:8.2g}  {name}: {meaning}"
+def _estimate(row: ParameterRow) -> str:
+    """Return the estimate and its error in a cell of a table."""
+    if np.isnan(row.estimate):
+        return "not determined"
+    is_rejected = row.estimate < row.low or row.estimate > row.high
+    value = f"{row.estimate:.5g} +- {row.std_err:.2g}"
+    return f"{value} (rejected)" if is_rejected else value
 
 
-def alternative_rows(result: Fit) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Return the head and the rows of the table of the alternatives."""
-    cells = []
-    for x in result.alternatives:
-        needed = f"no (needs {x.error_reduction_needed:.2g}x smaller errors)"
-        answer = "preferred by the data" if x.preferred else "yes" if x.distinguishable else needed
-        limits = f"{x.low[0]:.3g} .. {x.high[0]:.3g}"
-        if x.restitution is not None:
-            limits = f"none: eps = {x.restitution:.3g}"
-        cells.append((x.name, f"{x.improvement:.2g}", f"{x.estimate[0]:.3g}", limits, answer))
-    symbol = symbol_of(result.names[0])
-    return ("alternative explanation", "-2 ln L drop", symbol, "95 %", "distinguishable"), cells
+def _value_in_file(row: ParameterRow) -> str:
+    """Return the value in the file in a cell of a table, with the difference of the estimate."""
+    if not row.header:
+        return ""
+    if np.isnan(row.estimate):
+        return f"{row.header:.5g}"
+    return f"{row.header:.5g} ({100 * (row.estimate / row.header - 1):+.2f} %)"
 
 
-def _alternatives(result: Fit) -> Iterator[str]:
-    """Yield the table of the alternatives, with the values of the first parameter."""
-    head, cells = alternative_rows(result)
-    if cells:
-        yield ""
-        yield from table(head, cells)
+def _is_time(row: ParameterRow) -> bool:
+    """Tell whether a parameter is t0, which may be 0: then its error is given in ms."""
+    return row.parameter.endswith("t0")
+
+
+def _shares(row: ParameterRow) -> list[tuple[str, float]]:
+    """Return the parts of an error in per cent of the estimate; for t0 in ms."""
+    scale = 1e-3 if _is_time(row) else abs(row.estimate) / 100
+    return [(name, size / scale) for name, size in row.largest_parts]
+
+
+def _budget(row: ParameterRow) -> str:
+    unit = "ms" if _is_time(row) else "%"
+    parts = [f"{name} {share:.2g} {unit}" for name, share in _shares(row)]
+    return _line("budget", symbol=row.parameter, parts=", ".join(parts))
+
+
+def _budget_table(row: ParameterRow) -> Iterator[str]:
+    """Yield the parts of an error, each with its meaning."""
+    words = "ms" if _is_time(row) else "per cent"
+    yield ""
+    yield _line("budget table", symbol=row.parameter, words=words)
+    for name, share in _shares(row):
+        meaning = BUDGET_PARTS.get(name, LINES["other part"])
+        yield _line("budget row", share=share, name=name, meaning=meaning)

@@ -24,6 +24,11 @@ MAX_ROWS = 20
 CONDITIONAL = "assuming no other effect"
 """Name of estimates and standard errors that hold if the scene is complete."""
 
+DETERMINED = "determined"
+NOT_DETERMINED = "not determined"
+NOT_CONSISTENT = "not consistent"
+"""Grades of `Fit.grade`."""
+
 RESULT = "result"
 """Entry of a JSON file that holds a `Fit`."""
 
@@ -157,13 +162,12 @@ class Fit:
         Raises:
             ValueError: for a parameter that was not free.
         """
-        elements = self.element_names
-        names = self.names_of_elements
-        found = [i for i, both in enumerate(zip(elements, names, strict=True)) if name in both]
-        if not found:
+        if name in self.element_names:
+            at = self.element_names.index(name)
+        elif name in self.names_of_elements:
+            at = np.flatnonzero([vector == name for vector in self.names_of_elements])
+        else:
             raise ValueError(f"{name!r} was not free; free were {', '.join(self.names)}")
-        is_number = elements[found[0]] == name
-        at = found[0] if is_number else np.asarray(found)
         return self.estimate[at], self.standard_error[at]
 
     @property
@@ -180,7 +184,7 @@ class Fit:
     @property
     def _shapes(self) -> dict[str, tuple[int, ...]]:
         """Shapes of the parameters."""
-        gases = self.gas if isinstance(self.gas, dict) else {"": self.gas}
+        gases = by_label(self.gas)
         shapes = {}
         for name in self.names:
             label, _, short = name.rpartition(": ")
@@ -254,3 +258,8 @@ class Fit:
                     f"not a fit that this version of jaxgran wrote ({error!r:.80}); give the JSON "
                     "file of jaxgran.Fit.save or of jaxgran fit"
                 ) from None
+
+
+def by_label(of_fit: Any) -> dict[str, Any]:
+    """Return `Fit.gas` or `Fit.curve` as a dictionary, in which a single one has the label ""."""
+    return of_fit if isinstance(of_fit, dict) else {"": of_fit}

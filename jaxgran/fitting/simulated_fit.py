@@ -29,7 +29,7 @@ from jaxgran.fitting.information import (
     undetermined,
 )
 from jaxgran.fitting.measured_rows import curve_rows, with_rate_error
-from jaxgran.fitting.messages import say
+from jaxgran.fitting.messages import Message
 from jaxgran.fitting.parameters import (
     SMOOTHNESS,
     Priors,
@@ -267,7 +267,7 @@ def _result(
         else:
             notes.append(NOT_COMPARED)
     if bias >= MIN_REPORTED_BIAS:
-        notes.append(say("slopes", share=100 * bias))
+        notes.append(str(Message("slopes", share=100 * bias)))
     residuals = expansion.residuals
     (whole,) = average.comparison.residuals(0)
     log_variance = whole.log_variance + np.log(expansion.scatter)

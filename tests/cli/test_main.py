@@ -126,6 +126,14 @@ def test_every_command_has_help(run, command):
     assert status == 0 and "Usage: jaxgran" in out
 
 
+@pytest.mark.parametrize("variable, value", [("NO_COLOR", "1"), ("TERM", "dumb")])
+def test_a_terminal_without_colours_gets_no_escape_codes(capsys, monkeypatch, variable, value):
+    monkeypatch.setenv(variable, value)
+    assert main(["fit", "--help"]) == 0 and main(["melt"]) == 2
+    out, err = capsys.readouterr()
+    assert "\x1b" not in out + err
+
+
 def test_models_are_found_by_their_names(measured, run, monkeypatch):
     fitted = []
 

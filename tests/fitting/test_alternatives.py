@@ -11,7 +11,7 @@ import pytest
 import jaxgran
 from jaxgran.fitting import estimate
 from jaxgran.fitting.alternatives import Alternative, Explanations
-from jaxgran.fitting.messages import describe_search
+from jaxgran.fitting.conclusions import describe_search
 from jaxgran.models.linearise import with_neutral_elements
 from jaxgran.scene.laws import ViscoelasticVariant
 from tests.beads import glass_beads
@@ -130,8 +130,8 @@ def test_verdicts(monkeypatch, limitations, p_value, grade, verdict):
 
 def test_few_particles_are_told():
     result = fitted(*cooled_beads(1))
-    (words,) = describe_search(dataclasses.replace(result, model=jaxgran.DSMC(10)))
-    assert words.startswith("10 particles are too few for their noise to be known")
+    (message,) = describe_search(dataclasses.replace(result, model=jaxgran.DSMC(10)))
+    assert str(message).startswith("10 particles are too few for their noise to be known")
 
 
 def test_errors_that_are_too_large_are_named():

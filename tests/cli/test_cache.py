@@ -1,4 +1,4 @@
-"""What all commands share: colours, and the cache of compiled programs."""
+"""The cache of compiled programs."""
 
 import os
 import subprocess
@@ -8,14 +8,6 @@ import jax
 import pytest
 
 from jaxgran.cli.main import main
-
-
-@pytest.mark.parametrize("variable, value", [("NO_COLOR", "1"), ("TERM", "dumb")])
-def test_a_terminal_without_colours_gets_no_escape_codes(capsys, monkeypatch, variable, value):
-    monkeypatch.setenv(variable, value)
-    assert main(["fit", "--help"]) == 0 and main(["melt"]) == 2
-    out, err = capsys.readouterr()
-    assert "\x1b" not in out + err
 
 
 @pytest.fixture

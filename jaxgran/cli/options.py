@@ -1,29 +1,28 @@
-"""Options of the commands, models by name, and the compilation cache."""
+"""Options of the commands: their types, and what their values stand for."""
 
-import os
-import platform
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import jax
 from cyclopts import Parameter, Token
-from platformdirs import user_cache_path
 
 from jaxgran._utils.validation import POSITIVE
+from jaxgran.data.files import name_in_errors
+from jaxgran.data.header import OPTIONAL_KEYS, PRIOR_KEYS
+from jaxgran.data.tables import UNIT_KEYS, header_in_si
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.parameters import BY_SYMBOL
 
 ModelName = Literal["kinetic-theory", "dsmc", "hard-spheres", "soft-spheres"]
 """Models of `jaxgran cool`. The names are literals because making the models would start XLA before
-a command has set its options (`use_compilation_cache`)."""
+a command has set its options (`jaxgran.cli.cache.use_compilation_cache`)."""
 
 ModelOrAuto = Literal[ModelName, "auto"]
 """Models of `jaxgran fit`, which can also choose one."""
 
 Several = Parameter(consume_multiple=True)
-
+"""An option that takes one or more arguments."""
 
 MAX_NUMBER = 2**63
 """Upper bound of whole numbers, as of the seeds of `jax.random.key`."""
@@ -101,7 +100,7 @@ class FitOptions:
     no_cache: bool = False
 
 
-def models_by_name(models) -> dict[str, AbstractModel]:
+def models_by_name(models: Sequence[AbstractModel]) -> dict[str, AbstractModel]:
     """Return models by their names on the command line, such as "soft-spheres"."""
     return {model.name.lower().replace(" ", "-"): model for model in models}
 
@@ -111,56 +110,17 @@ def check_tolerance(tolerance: float) -> None:
     POSITIVE.check("--tolerance", tolerance, "0.02 allows an error of T of 2 %.")
 
 
-NO_CACHE_VARIABLE = "JAXGRAN_NO_CACHE"
-"""An environment variable: any value but 0 disables the compilation cache."""
-
-
-def use_compilation_cache(folder: Path | None = None) -> bool:
-    """Let JAX store the programs that this process compiles, and load those stored before.
-
-    The cache is not used if `NO_CACHE_VARIABLE` disables it, if JAX already has a cache folder
-    (JAX_COMPILATION_CACHE_DIR), or if others can access the folder: its files are programs that JAX
-    runs.
-
-    Args:
-        folder: created with access for the user alone; by default a folder of this command in the
-            user's cache folder.
-
-    Returns:
-        Whether the cache is used.
-    """
-    disabled = os.environ.get(NO_CACHE_VARIABLE, "0") != "0"
-    if disabled or jax.config.values["jax_compilation_cache_dir"] is not None:
-        return False
-    folder = user_cache_path("jaxgran") / "compiled" if folder is None else folder
-    if not _is_private(folder):
-        return False
-    _compile_for_avx2()
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    return True
-
-
-def _is_private(folder: Path) -> bool:
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        stat = folder.stat()
-    except OSError:
-        return False
-    if hasattr(os, "getuid") and (stat.st_uid != os.getuid() or stat.st_mode & 0o077):
-        return False
-    return os.access(folder, os.W_OK | os.X_OK)
-
-
-def _compile_for_avx2() -> None:
-    """Compile for AVX2, so that JAX loads cached programs without a page of warnings.
-
-    For newer instructions XLA adds tuning hints to a program (prefer-no-gather,
-    prefer-no-scatter). When XLA loads the program it takes them for features of the processor, does
-    not find them, and warns (openxla/xla, issue 44565). XLA reads this variable when it starts,
-    with the first array.
-    """
-    flags = os.environ.get("XLA_FLAGS", "")
-    if platform.machine().lower() in ("x86_64", "amd64") and "xla_cpu_max_isa" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_max_isa=AVX2".strip()
+def parse_settings(pairs: Sequence[str]) -> dict[str, str]:
+    """Return header entries from the arguments KEY=VALUE of --set."""
+    known = (*BY_SYMBOL, *PRIOR_KEYS, *OPTIONAL_KEYS, *UNIT_KEYS)
+    values = {}
+    for pair in pairs:
+        key, equals, value = pair.partition("=")
+        if not equals or key not in known:
+            raise ValueError(f"--set {pair}: give KEY=VALUE with KEY one of {', '.join(known)}")
+        if key in values:
+            raise ValueError(f"--set gives {key} twice, {values[key]} and {value}: remove one")
+        values[key] = value
+    with name_in_errors(Path("--set")):
+        header_in_si(values)
+    return values
