@@ -185,7 +185,7 @@ class AbstractSpheres(AbstractParticleModel):
     ) -> AbstractSphereDynamics:
         """Return the motion of the spheres, with arrays of the sizes that it needs."""
         sizes = self._known_sizes(scene, dimension, replicas)
-        engine = choose_engine(self.neighbours, sizes.engine, traced)
+        engine = choose_engine(self.neighbours, sizes.engine, traced=traced)
         if traced and engine == "jax-md":
             raise ValueError(
                 'inside jax.jit or jax.vmap neighbours="jax-md" is not supported, since it sizes '
@@ -231,7 +231,7 @@ class AbstractSpheres(AbstractParticleModel):
         )
         arrays = -(-members // MEMBERS)
         longer = sizes._replace(capacity=sizes.capacity.of_members(arrays))
-        engine = choose_engine(self.neighbours, sizes.engine, True)
+        engine = choose_engine(self.neighbours, sizes.engine, traced=True)
         return self.motion(together, (count, self.num_particles, dimension), longer, engine)
 
     def _known_sizes(self, scene: SphereScene, dimension: int, replicas: int) -> ArraySizes:

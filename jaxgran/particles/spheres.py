@@ -21,7 +21,8 @@ from jaxgran._utils import status
 from jaxgran.particles import observables
 from jaxgran.particles.capacity import Capacity, skin_for_pairs
 from jaxgran.particles.dynamics import AbstractDynamics, advance_time, time_left
-from jaxgran.particles.neighbours.lists import ListedPairs, Pairs, search_pairs, with_offsets, wrap
+from jaxgran.particles.neighbours.lists import search_pairs
+from jaxgran.particles.neighbours.pairs import ListedPairs, Pairs, with_offsets, wrap
 from jaxgran.particles.start import (
     Placement,
     PlacementState,
@@ -295,9 +296,15 @@ class AbstractSphereDynamics(AbstractDynamics):
         number is not finite, or a step cannot become shorter. The state is then the given one.
         """
         before, listed, end = self.prepare(state, until)
-        cutoff = 1 + before.skin
-        sizes = self.capacity[:2]
-        found = search_pairs(listed, self.scene.side, cutoff, self.replicas, sizes, self.engine)
+        found = search_pairs(
+            listed,
+            self.scene.side,
+            1 + before.skin,
+            replicas=self.replicas,
+            capacity=self.capacity.pairs,
+            ahead=self.capacity.lookahead,
+            engine=self.engine,
+        )
         return self._run_until_stale(state, before, listed, found, end)
 
     @jax.jit
