@@ -284,7 +284,7 @@ class HardDynamics(AbstractSphereDynamics):
         disturbed = jnp.minimum(jnp.minimum(free.final[i], free.final[j]), duration)
         closer = free.motion.gap(disturbed) < 2 * rows.bound * (duration - disturbed)
         selected = rows.real & (jnp.isfinite(free.times) | closer)
-        at_walls = jnp.zeros(n, bool) if free.wall_times is None else jnp.isfinite(free.wall_times)
+        at_walls = jnp.zeros(n, bool) if free.walls is None else jnp.isfinite(free.walls.times)
         max_rows = self.capacity.contacts
         max_members = self.capacity.members
         found = select_members(selected, i, j, at_walls, max_rows=max_rows, max_members=max_members)
