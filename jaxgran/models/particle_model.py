@@ -145,8 +145,9 @@ class AbstractParticleModel(AbstractModel):
         start = reduced_start(self.start, gas, differentiable=not self.projected)
         key = jax.random.key(0) if run.key is None else run.key
         simulated = partial(self._simulated, gas.dimension)
+        without_files = Run(run.key, run.progress)
         rule = self.differentiable(
-            partial(simulated, run), partial(simulated, Run(run.key, run.progress))
+            run=partial(simulated, run), shifted=partial(simulated, without_files)
         )
         result = rule(scene, reduced, start, Constants(key, units, seconds=times))
         return self._curve(gas, times, units, result, invalid, fault, run.save == "particles")

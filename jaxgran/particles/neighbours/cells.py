@@ -93,7 +93,7 @@ class Rows(NamedTuple):
     shift: Int[Array, "rows"]
 
 
-class Run(NamedTuple):
+class SlotRun(NamedTuple):
     """Successive slots with which each sorted particle is compared.
 
     Attributes:
@@ -176,7 +176,7 @@ def pairs_by_cells(
         block, words = carry
         begin = WORD * block
         near = [
-            _near_in_window(here, there, Run(run.first + begin, run.count - begin), square)
+            _near_in_window(here, there, SlotRun(run.first + begin, run.count - begin), square)
             for run in runs
         ]
         return block + 1, words.at[block].set(jnp.stack(near))
@@ -314,7 +314,7 @@ def _slots(
 
 def _runs(
     grid: CellGrid, rows: Rows, particles: SortedParticles, slot: Int[Array, "n"]
-) -> list[Run]:
+) -> list[SlotRun]:
     """Return the runs with which the sorted particles, in these slots, are compared.
 
     In its own row a particle is compared with the following ones.
@@ -322,11 +322,11 @@ def _runs(
     reach = grid.cells_in_reach
     before = particles.place - reach
     after = particles.place + reach + 1
-    runs = [Run(slot + 1, _first_slot(grid, rows, particles.row, after) - slot - 1)]
+    runs = [SlotRun(slot + 1, _first_slot(grid, rows, particles.row, after) - slot - 1)]
     for row, exists in _neighbouring_rows(grid, particles.row):
         first = _first_slot(grid, rows, row, before)
         count = _first_slot(grid, rows, row, after) - first
-        runs.append(Run(first, jnp.where(exists, count, 0)))
+        runs.append(SlotRun(first, jnp.where(exists, count, 0)))
     return runs
 
 
@@ -372,7 +372,7 @@ def _neighbouring_rows(
 def _near_in_window(
     here: list[Int[Array, "n"]],
     there: list[Int[Array, "slots"]],
-    run: Run,
+    run: SlotRun,
     square: Float[Array, ""],
 ) -> UInt32[Array, "n"]:
     """Return which of the first 32 slots of a run are within the cutoff, as bits.
