@@ -233,7 +233,7 @@ def _integrate_until(
         t1=jnp.inf,
         y0=state,
         stepsize_controller=diffrax.PIDController(rtol=rtol, atol=atol, dtmax=0.25 + beta),
-        event=diffrax.Event(lambda s, state, beta, **_: end(state, beta) <= 0),
+        event=diffrax.Event(lambda t, y, args, **_: end(y, args) <= 0),
     )
     beyond = jax.tree.map(lambda leaf: leaf[-1], overshot.ys)
 
