@@ -199,6 +199,12 @@ def exchange_gains(
 
     They are along the directions of `tangents`, then in the logarithm of all velocities, and of all
     spins where spheres rotate, as `ExchangeTangents.after` takes them.
+
+    Args:
+        scene: the gas.
+        tangents: which give the directions and the number of energies.
+        impact: the spheres at impacts.
+        happens: whether each impact does; the others gain nothing.
     """
 
     def energies(material: ReducedScene, log_scales: Float[Array, "energies"]) -> Array:
@@ -215,16 +221,17 @@ def exchange_gains(
             gained.append(effect.rotational_gain)
         return jnp.where(happens, jnp.stack(gained), 0.0)
 
-    num_energies = tangents.energies.shape[1]
-    none = jnp.zeros(num_energies, impact.speed.dtype)
-    _, linear = jax.linearize(energies, scene.material, none)
-    num_directions = len(tangents.energies)
-    scales = jnp.concatenate([jnp.zeros((num_directions, num_energies)), jnp.eye(num_energies)])
+    num_directions, num_energies, *_ = tangents.energies.shape
+    unscaled = jnp.zeros(num_energies, impact.speed.dtype)
+    _, linear = jax.linearize(energies, scene.material, unscaled)
 
     def padded(directions: Array) -> Array:
         return jnp.pad(directions, [(0, num_energies), *[(0, 0)] * (directions.ndim - 1)])
 
-    return jax.vmap(linear)(jax.tree.map(padded, tangents.directions), scales.astype(none.dtype))
+    # First the directions without a scale, then each scale without a direction.
+    directions = jax.tree.map(padded, tangents.directions)
+    scales = jnp.concatenate([jnp.zeros((num_directions, num_energies)), jnp.eye(num_energies)])
+    return jax.vmap(linear)(directions, scales.astype(unscaled.dtype))
 
 
 class IndependentPairs(NamedTuple):
