@@ -131,21 +131,26 @@ def first_impacts(
     r = paths.x[a] - paths.x[b] - rows.offset
     w = paths.v[a] - paths.v[b]
     motion = RelativeMotion(jnp.sum(r * r, -1), jnp.sum(r * w, -1), jnp.sum(w * w, -1))
-    times = motion.impact_time(jnp.maximum(jnp.maximum(paths.last[a], paths.last[b]), 0.0))
+    last_of_a = paths.last[a]
+    last_of_b = paths.last[b]
+    times = motion.impact_time(jnp.maximum(jnp.maximum(last_of_a, last_of_b), 0.0))
     times = jnp.where(rows.real & (times < end), times, jnp.inf)
     first = jnp.full(len(paths.x), jnp.inf, times.dtype).at[a].min(times).at[b].min(times)
     walls = None
     if container is not None:
         walls = next_wall_impacts(container, paths, end)
         first = jnp.minimum(first, walls.times)
-    final = _final_until(paths, rows, motion, first, end)
+    speed = jnp.sqrt(jnp.sum(paths.v**2, -1))
+    final = _final_until(rows, motion, last_of_a, last_of_b, speed, first, end)
     return FirstImpacts(r, w, motion, times, walls, first, final)
 
 
 def _final_until(
-    paths: Paths,
     rows: PairRows,
     motion: RelativeMotion,
+    last_of_a: Float[Array, "rows"],
+    last_of_b: Float[Array, "rows"],
+    speed: Float[Array, "slots"],
     first: Float[Array, "slots"],
     end: ArrayLike,
 ) -> Float[Array, "slots"]:
@@ -158,9 +163,6 @@ def _final_until(
     """
     a = rows.a
     b = rows.b
-    last_of_a = paths.last[a]
-    last_of_b = paths.last[b]
-    speed = jnp.sqrt(jnp.sum(paths.v**2, -1))
     closing_on_a = rows.bound + speed[a]
     closing_on_b = rows.bound + speed[b]
 
