@@ -33,8 +33,9 @@ from jaxgran.fitting.simulations import MAX_LINEARISED
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_gas, checked_key, checked_model
 from jaxgran.models.kinetic_theory import KineticTheory
-from jaxgran.scene.gas import Gas, law_fields
+from jaxgran.scene.gas import Gas
 from jaxgran.scene.laws import RestitutionLaw
+from jaxgran.scene.parameter_fields import law_fields
 from jaxgran.scene.parameters import BY_SYMBOL, MATERIAL, PARAMETERS, symbol_of
 
 GRAIN_PARAMETERS = ("diameter", "diameter_sd", DENSITY)

@@ -11,8 +11,8 @@ from jaxgran.fitting.comparison import Residuals
 from jaxgran.fitting.problem import Evaluation, Problem
 from jaxgran.fitting.rows import SCATTER
 from jaxgran.fitting.search import Minimum
-from jaxgran.scene.gas import law_fields
 from jaxgran.scene.laws import RestitutionLaw
+from jaxgran.scene.parameter_fields import law_fields
 
 DEGENERATE = 9.0
 """Difference of -2 ln L up to which two minima are equally good: three standard errors."""

@@ -14,8 +14,9 @@ from jaxgran._utils.validation import POSITIVE
 from jaxgran.data.curve import CoolingCurve, above_noise
 from jaxgran.fitting.parameters import as_floats, residuals_and_slopes, with_parameters
 from jaxgran.fitting.result import Fit
-from jaxgran.scene.gas import Gas, law_fields
+from jaxgran.scene.gas import Gas
 from jaxgran.scene.laws import RestitutionSpline
+from jaxgran.scene.parameter_fields import law_fields
 
 NUM_COMPARED = 9
 """Number of speeds over the visited range at which laws are compared."""

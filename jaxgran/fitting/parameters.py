@@ -17,8 +17,9 @@ from jaxgran._utils.validation import Domain
 from jaxgran.data.curve import CoolingCurve, above_noise
 from jaxgran.data.drop_test import PLATE, WALL, DropTest
 from jaxgran.data.measurement import DENSITY, START_TIME, Priors, prior_domain
-from jaxgran.scene.gas import Gas, law_fields
+from jaxgran.scene.gas import Gas
 from jaxgran.scene.laws import C1, ConstantRestitution, RestitutionSpline, Viscoelastic
+from jaxgran.scene.parameter_fields import law_fields
 from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
 
 LAW = "law"

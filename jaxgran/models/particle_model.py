@@ -4,13 +4,13 @@ import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from equinox import AbstractClassVar, AbstractVar
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced, nan_where
@@ -19,12 +19,42 @@ from jaxgran.gradients.rule import Result
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.members import by_member, together
-from jaxgran.particles import snapshot
 from jaxgran.particles.dynamics import AbstractDynamics
 from jaxgran.particles.elements import flight_time
 from jaxgran.particles.run import Recorder, grouped, run_on_host, run_traced, start_traced
+from jaxgran.particles.snapshot import Units, resolve_save
 from jaxgran.particles.start import has_other_box, reduced_start
 from jaxgran.scene.gas import Gas
+
+
+class Constants(NamedTuple):
+    """Inputs of a run that have no derivatives.
+
+    Attributes:
+        key: of the random numbers.
+        units: of the run.
+        seconds: the times of the records in SI.
+    """
+
+    key: PRNGKeyArray
+    units: Units
+    seconds: Float[Array, "times"]
+
+
+class TracedInputs(NamedTuple):
+    """Inputs of a traced run besides its scene.
+
+    Attributes:
+        times: of the records, in units of the run.
+        start: given positions and velocities in units of the run; None for random ones.
+        constants: inputs that have no derivatives.
+        directions: of tangents in the material; None for no tangents.
+    """
+
+    times: Any
+    start: Any
+    constants: Constants
+    directions: Any
 
 
 class AbstractParticleModel(AbstractModel):
@@ -55,7 +85,7 @@ class AbstractParticleModel(AbstractModel):
         """Return the gas in the units of the run."""
 
     @abstractmethod
-    def units(self, gas: Gas) -> snapshot.Units:
+    def units(self, gas: Gas) -> Units:
         """Return the units of the run."""
 
     @abstractmethod
@@ -78,7 +108,7 @@ class AbstractParticleModel(AbstractModel):
         """Return a run with derivatives, see `jaxgran.gradients.rule.differentiable`.
 
         Args:
-            run: a function of the scene, the times, the start, all else, and directions.
+            run: a function of the scene, the times, the start, the `Constants`, and directions.
             shifted: the same function without files, for further runs.
         """
 
@@ -115,10 +145,11 @@ class AbstractParticleModel(AbstractModel):
         start = reduced_start(self.start, gas, differentiable=not self.projected)
         key = jax.random.key(0) if run.key is None else run.key
         simulated = partial(self._simulated, gas.dimension)
+        without_files = Run(run.key, run.progress)
         rule = self.differentiable(
-            partial(simulated, run), partial(simulated, Run(run.key, run.progress))
+            run=partial(simulated, run), shifted=partial(simulated, without_files)
         )
-        result = rule(scene, reduced, start, (key, units, times))
+        result = rule(scene, reduced, start, Constants(key, units, seconds=times))
         return self._curve(gas, times, units, result, invalid, fault, run.save == "particles")
 
     def invalid_times(
@@ -140,7 +171,7 @@ class AbstractParticleModel(AbstractModel):
         scene: Any,
         times: Float[Array, "times"],
         start: Any,
-        others: Any,
+        constants: Constants,
         directions: Any = None,
     ) -> Result:
         """Return the result of a run, from the host unless a number is traced.
@@ -149,52 +180,63 @@ class AbstractParticleModel(AbstractModel):
             dimension: d.
             run: options.
             scene, times, start: the gas, the times and a given start in units of the run.
-            others: key of the random numbers, units of the run, and the times in SI.
+            constants: inputs that have no derivatives.
             directions: of tangents in the material; None for no tangents.
         """
-        save = snapshot.resolve_save(run.save)
-        if any_traced(scene, times, start, others):
+        save = resolve_save(run.save)
+        if any_traced(scene, times, start, constants):
             checks.refuse_files(self, run)
             traced = partial(self._run_traced, dimension, save)
             if save is None and start is None and directions is None and self.projected:
                 traced = together(traced, partial(self._run_members, dimension))
-            return traced(scene, (times, start, others, directions))
-        key, units, seconds = others
+            return traced(scene, TracedInputs(times, start, constants, directions))
         groups = grouped(self.replicas, self.num_particles if self.has_positions else 0)
         dynamics = self.dynamics(scene, dimension, self.replicas // groups.number)
-        recorder = Recorder(dynamics, units, save)
-        return run_on_host(recorder, times, start, key, directions, groups, run, seconds)
+        recorder = Recorder(dynamics, constants.units, save)
+        return run_on_host(
+            recorder, times, start, constants.key, directions, groups, run, constants.seconds
+        )
 
-    def _run_traced(self, dimension: int, save: Any, scene: Any, others: Any) -> Result:
+    def _run_traced(
+        self, dimension: int, save: Callable | None, scene: Any, inputs: TracedInputs
+    ) -> Result:
         """Return the result of a run of numbers some of which are traced."""
-        times, start, (key, units, _), directions = others
         dynamics = self.dynamics(scene, dimension, self.replicas, traced=True)
-        recorder = Recorder(dynamics, units, save)
-        return run_traced(recorder, times, start, key, directions)
+        recorder = Recorder(dynamics, inputs.constants.units, save)
+        return run_traced(
+            recorder, inputs.times, inputs.start, inputs.constants.key, inputs.directions
+        )
 
     def _run_members(
-        self, dimension: int, scene: Any, others: Any, differs: Any, members: int
+        self,
+        dimension: int,
+        scene: Any,
+        inputs: TracedInputs,
+        differs: tuple[Any, TracedInputs],
+        members: int,
     ) -> Result | None:
         """Return the result of members of a batch in one array; None if they cannot share it.
 
-        They have a common start, as they would have alone, or one for each key.
+        Args:
+            dimension: d.
+            scene: of all members in the units of the run.
+            inputs: of all members; no start is given, and no directions.
+            differs: the scene and the inputs with True at what has a first axis of members.
+            members: number of members.
         """
-        scene_differs, (times_differ, _, (key_differs, *constants_differ), _) = differs
-        times, _, (key, units, _), _ = others
+        scene_differs, inputs_differ = differs
         dynamics = self.merged(dimension, scene, scene_differs, members)
-        if dynamics is None or any(jax.tree.leaves((times_differ, constants_differ))):
+        others_differ = inputs_differ.times, inputs_differ.constants._replace(key=False)
+        if dynamics is None or any(jax.tree.leaves(others_differ)):
             return None
         first = jax.tree.map(lambda x, has_axis: x[0] if has_axis else x, scene, scene_differs)
         alone = self.dynamics(first, dimension, self.replicas, traced=True)
-        if key_differs:
-            start, faults = jax.vmap(partial(start_traced, alone))(key)
-            start = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), start)
-            fault = jnp.bitwise_or.reduce(faults)
-            key = key[0]
-        else:
-            start, fault = start_traced(alone, key)
-            start = jax.tree.map(lambda x: jnp.tile(x, (members, 1)), start)
-        result = run_traced(Recorder(dynamics, units, None), times, start, key, None, fault)
+        key = inputs.constants.key
+        key_differs = bool(inputs_differ.constants.key)
+        start, fault = _start_of_members(alone, key, key_differs, members)
+        recorder = Recorder(dynamics, inputs.constants.units, None)
+        first_key = key[0] if key_differs else key
+        result = run_traced(recorder, inputs.times, start, first_key, None, fault)
         return by_member(result, members)
 
     @eqx.filter_jit
@@ -202,7 +244,7 @@ class AbstractParticleModel(AbstractModel):
         self,
         gas: Gas,
         times: Float[Array, "times"],
-        units: snapshot.Units,
+        units: Units,
         result: Result,
         invalid: Bool[Array, "times"],
         fault: Int[Array, ""],
@@ -225,7 +267,7 @@ class AbstractParticleModel(AbstractModel):
         }
         others = {}
         if self.has_positions:
-            others["particles"] = snapshot.to_particles(units, self.replicas, *result.particles)
+            others["particles"] = units.to_particles(self.replicas, *result.particles)
         if "flow_share" in values:
             others["derivative_bias"] = self.derivative_bias(gas, times, values["flow_share"])
         curve = CoolingCurve.of_replicas(times, values, status=result.status | fault, **others)
@@ -236,3 +278,18 @@ class AbstractParticleModel(AbstractModel):
             return curve.with_saved(jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), saved))
         box_side = jnp.broadcast_to(units.box_side, (len(times), *units.box_side.shape))
         return dataclasses.replace(curve, saved=saved._replace(box_side=box_side))
+
+
+def _start_of_members(
+    alone: AbstractDynamics, key: Array, key_differs: bool, members: int
+) -> tuple[Any, Int[Array, ""]]:
+    """Return the random starts of members of a batch in one array, and their faults.
+
+    The members have a common start, as one of them would have alone, or one for each key.
+    """
+    if not key_differs:
+        start, fault = start_traced(alone, key)
+        return jax.tree.map(lambda x: jnp.tile(x, (members, 1)), start), fault
+    starts, faults = jax.vmap(partial(start_traced, alone))(key)
+    start = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), starts)
+    return start, jnp.bitwise_or.reduce(faults)

@@ -28,14 +28,12 @@ from jaxgran.particles.start import check_inside, check_start
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced import SphereScene
 
+S = TypeVar("S", bound="AbstractSpheres")
+
 DIFFERENCE_STEPS = Domain(0.0, 0.5, high_allowed=True)
 """Allowed steps of differences: the lower value of alpha must stay positive."""
 
-
-S = TypeVar("S", bound="AbstractSpheres")
-
-
-MEMBERS = 8
+SIZED_MEMBERS = 8
 """Number of members of a batch for which the lengths of arrays are computed: more members get a
 multiple of them."""
 
@@ -49,7 +47,7 @@ class ArraySizes(NamedTuple):
         capacity: sizes of the arrays of the run.
         equilibration_capacity: sizes of the arrays in the first mean free times of equilibration.
         engine: search for pairs in compiled code, for which `lookahead` of the sizes is made.
-        of_batch: sizes for `MEMBERS` such gases in one array; None for known numbers.
+        of_batch: sizes for `SIZED_MEMBERS` such gases in one array; None for known numbers.
     """
 
     made_for: tuple[tuple[str, Any], ...]
@@ -104,95 +102,6 @@ class AbstractSpheres(AbstractParticleModel):
     def refused_derivatives(self, scene: SphereScene) -> dict[str, Any]:
         """Return numbers of a scene in which the derivative of a run is not known, by a message."""
 
-    def neighbourhood(self, scene: SphereScene, dimension: int, replicas: int) -> Neighbourhood:
-        """Return the expected numbers of neighbours in a scene of known numbers."""
-        side = float(scene.filled_side)
-        n = self.num_particles
-        longer = 1.0
-        if scene.container is not None:  # the sweep runs along the first axis
-            longer = max(1.0, side / float(scene.container[0]))
-        return Neighbourhood.expected(
-            side,
-            n,
-            replicas,
-            dimension,
-            self.listed_by_skin,
-            engine=self.neighbours,
-            longer=longer,
-        )
-
-    def derivative_error(self, error_model: ErrorModel) -> Float[np.ndarray, "times"]:
-        """Relative error of projected derivatives by a flow, or of differences by their noise."""
-        if self.differences is None:
-            return error_model.slope_error()
-        return error_model.noise_of_differences(
-            self.differences, math.hypot(*self.noise(error_model))
-        )
-
-    def check_fit(self, names: tuple[str, ...]) -> None:
-        """Refuse plain derivatives, and the temperature and lengths of a given start."""
-        if not self.projected:
-            raise ValueError(
-                f"a fit needs projected derivatives. Give {type(self).__name__} a projection."
-            )
-        fixed = [n for n in ("temperature", "diameter", "packing_fraction") if n in names]
-        if self.start is not None and fixed:
-            raise ValueError(
-                f"{' and '.join(fixed)} cannot be fitted from a given start, which fixes them. "
-                f"Leave start out of {type(self).__name__}, or free other parameters."
-            )
-
-    def sized_for(self: S, gas: Gas, spare: float = 2.0) -> S:
-        """Return this model with fixed sizes of its arrays, for `jax.jit`.
-
-        Outside of jit sizes follow from the gas, and arrays grow if they must. Inside they are
-        fixed; a run that exceeds them ends in nan and a status.
-
-        Args:
-            gas: a gas of known numbers that represents the later ones: the densest, hottest and
-                softest of them.
-            spare: capacity over the expected need.
-        """
-        checked_float("spare", spare, POSITIVE, "2 is twice the expected need.")
-        self.check_scene(checks.checked_gas(gas))
-        needed = partial(self.needed_sizes, self.scene(gas), gas.dimension)
-        of_batch = needed(MEMBERS * self.replicas, spare)
-        sizes = needed(self.replicas, spare)._replace(of_batch=of_batch)
-        return dataclasses.replace(self, _sizes=sizes)
-
-    def units(self, gas: Gas) -> Units:
-        """Return the diameter and the thermal speed as units."""
-        speed = jnp.sqrt(gas.temperature)
-        return Units.from_gas(gas, self.num_particles, gas.diameter, speed)
-
-    def differentiable(
-        self, run: Callable[..., Result], shifted: Callable[..., Result]
-    ) -> Callable[..., Result]:
-        """Return runs with projected derivatives, with differences of runs, or unchanged."""
-        if not self.projected:
-            return run
-        if self.differences is not None:
-            run = by_differences(run, shifted, self.differences)
-        return differentiable(
-            run,
-            material=lambda scene: scene.material,
-            frequency=lambda scene: scene.collision_frequency,
-            refused=self.refused_derivatives,
-        )
-
-    def dynamics(
-        self, scene: SphereScene, dimension: int, replicas: int, traced: bool = False
-    ) -> AbstractSphereDynamics:
-        """Return the motion of the spheres, with arrays of the sizes that it needs."""
-        sizes = self._known_sizes(scene, dimension, replicas)
-        engine = choose_engine(self.neighbours, sizes.engine, traced)
-        if traced and engine == "jax-md":
-            raise ValueError(
-                'inside jax.jit or jax.vmap neighbours="jax-md" is not supported, since it sizes '
-                "its cells from known numbers: leave neighbours out"
-            )
-        return self.motion(scene, (replicas, self.num_particles, dimension), sizes, engine)
-
     @abstractmethod
     def laws_of_replicas(self, laws: Any, differs: Any) -> Any:
         """Return the law of the impacts of replicas that have different ones.
@@ -204,68 +113,6 @@ class AbstractSpheres(AbstractParticleModel):
         Returns:
             The law; None if replicas with different numbers cannot share an array.
         """
-
-    def merged(
-        self, dimension: int, scene: SphereScene, differs: SphereScene, members: int
-    ) -> AbstractSphereDynamics | None:
-        """Return the motion of members that differ in their law alone; None for all others."""
-        material = differs.material._replace(law=None)
-        others = differs._replace(material=material, contact_duration=False)
-        if self._sizes is None or self._sizes.of_batch is None or any(jax.tree.leaves(others)):
-            return None
-        sizes = self._sizes.of_batch
-        count = members * self.replicas
-
-        def of_replicas(x: Array, is_batched: bool) -> Array:
-            if is_batched:
-                return jnp.repeat(x, self.replicas, axis=0)
-            return jnp.broadcast_to(x, (count, *jnp.shape(x)))
-
-        laws = jax.tree.map(of_replicas, scene.material.law, differs.material.law)
-        law = self.laws_of_replicas(laws, differs.material.law)
-        if law is None:
-            return None
-        together = scene._replace(
-            contact_duration=jnp.min(scene.contact_duration),
-            material=scene.material._replace(law=law),
-        )
-        arrays = -(-members // MEMBERS)
-        longer = sizes._replace(capacity=sizes.capacity.of_members(arrays))
-        engine = choose_engine(self.neighbours, sizes.engine, True)
-        return self.motion(together, (count, self.num_particles, dimension), longer, engine)
-
-    def _known_sizes(self, scene: SphereScene, dimension: int, replicas: int) -> ArraySizes:
-        """Return the sizes of the model, or new ones if all numbers that they need are known.
-
-        The sizes of the model are for all its replicas in one array.
-        """
-        name = type(self).__name__
-        if self._sizes is not None:
-            for setting, planned in self._sizes.made_for:
-                value = getattr(self, setting)
-                if planned != value:
-                    raise ValueError(
-                        f"this {name} was sized for {setting} = {planned!r}, and now has "
-                        f"{value!r}. Call sized_for(gas) again."
-                    )
-            if replicas == self.replicas:
-                return self._sizes
-        try:
-            with jax.ensure_compile_time_eval():
-                return self.needed_sizes(scene, dimension, replicas)
-        except jax.errors.ConcretizationTypeError:
-            raise ValueError(
-                "inside jax.jit the sizes of arrays must be known. Use "
-                f"{name}(...).sized_for(gas), with a gas of known numbers and outside of jax.jit."
-            ) from None
-
-    @eqx.filter_jit
-    def derivative_bias(self, gas: Gas, times: Array, flow_share: Array) -> Array | None:
-        """Estimate the bias of projected derivatives, 0 in a box below L_c, which has no flow."""
-        if self.differences is not None or not self.projected:
-            return None
-        has_flow = gas.box_side(self.num_particles) > gas.critical_box
-        return jnp.where(has_flow, slope_bias_of_run(times, jnp.mean(flow_share, axis=0)), 0.0)
 
     def check_counts(self, **minimum: int) -> None:
         """Check the whole numbers of the model against their minima, and its other settings."""
@@ -309,7 +156,168 @@ class AbstractSpheres(AbstractParticleModel):
                 "of the surface."
             )
 
+    def check_fit(self, names: tuple[str, ...]) -> None:
+        """Refuse plain derivatives, and the temperature and lengths of a given start."""
+        if not self.projected:
+            raise ValueError(
+                f"a fit needs projected derivatives. Give {type(self).__name__} a projection."
+            )
+        fixed = [n for n in ("temperature", "diameter", "packing_fraction") if n in names]
+        if self.start is not None and fixed:
+            raise ValueError(
+                f"{' and '.join(fixed)} cannot be fitted from a given start, which fixes them. "
+                f"Leave start out of {type(self).__name__}, or free other parameters."
+            )
+
     def noise(self, error_model: ErrorModel) -> tuple[float, float]:
         """Standard errors of ln T by shot noise and by the random amplitudes of a flow."""
         total = self.num_particles * self.replicas
         return error_model.shot_noise(total), error_model.flow_noise(self.replicas)
+
+    def derivative_error(self, error_model: ErrorModel) -> Float[np.ndarray, "times"]:
+        """Relative error of projected derivatives by a flow, or of differences by their noise."""
+        if self.differences is None:
+            return error_model.slope_error()
+        noise = math.hypot(*self.noise(error_model))
+        return error_model.noise_of_differences(self.differences, noise)
+
+    @eqx.filter_jit
+    def derivative_bias(self, gas: Gas, times: Array, flow_share: Array) -> Array | None:
+        """Estimate the bias of projected derivatives, 0 in a box below L_c, which has no flow."""
+        if self.differences is not None or not self.projected:
+            return None
+        has_flow = gas.box_side(self.num_particles) > gas.critical_box
+        return jnp.where(has_flow, slope_bias_of_run(times, jnp.mean(flow_share, axis=0)), 0.0)
+
+    def neighbourhood(self, scene: SphereScene, dimension: int, replicas: int) -> Neighbourhood:
+        """Return the expected numbers of neighbours in a scene of known numbers."""
+        side = float(scene.filled_side)
+        longer = 1.0
+        if scene.container is not None:  # the sweep runs along the first axis
+            longer = max(1.0, side / float(scene.container[0]))
+        return Neighbourhood.expected(
+            side,
+            self.num_particles,
+            replicas,
+            dimension,
+            listed_more=self.listed_by_skin,
+            engine=self.neighbours,
+            longer=longer,
+        )
+
+    def sized_for(self: S, gas: Gas, spare: float = 2.0) -> S:
+        """Return this model with fixed sizes of its arrays, for `jax.jit`.
+
+        Outside of jit sizes follow from the gas, and arrays grow if they must. Inside they are
+        fixed; a run that exceeds them ends in nan and a status.
+
+        Args:
+            gas: a gas of known numbers that represents the later ones: the densest, hottest and
+                softest of them.
+            spare: capacity over the expected need.
+        """
+        checked_float("spare", spare, POSITIVE, "2 is twice the expected need.")
+        self.check_scene(checks.checked_gas(gas))
+        needed = partial(self.needed_sizes, self.scene(gas), gas.dimension)
+        of_batch = needed(SIZED_MEMBERS * self.replicas, spare)
+        sizes = needed(self.replicas, spare)._replace(of_batch=of_batch)
+        return dataclasses.replace(self, _sizes=sizes)
+
+    def _known_sizes(self, scene: SphereScene, dimension: int, replicas: int) -> ArraySizes:
+        """Return the sizes of the model, or new ones if all numbers that they need are known.
+
+        The sizes of the model are for all its replicas in one array.
+        """
+        if self._sizes is not None:
+            self._check_made_for(self._sizes)
+            if replicas == self.replicas:
+                return self._sizes
+        try:
+            with jax.ensure_compile_time_eval():
+                return self.needed_sizes(scene, dimension, replicas)
+        except jax.errors.ConcretizationTypeError:
+            raise ValueError(
+                "inside jax.jit the sizes of arrays must be known. Use "
+                f"{type(self).__name__}(...).sized_for(gas), with a gas of known numbers and "
+                "outside of jax.jit."
+            ) from None
+
+    def _check_made_for(self, sizes: ArraySizes) -> None:
+        """Raise ValueError if the settings of the model have changed since it was sized."""
+        for setting, planned in sizes.made_for:
+            value = getattr(self, setting)
+            if planned != value:
+                raise ValueError(
+                    f"this {type(self).__name__} was sized for {setting} = {planned!r}, and now "
+                    f"has {value!r}. Call sized_for(gas) again."
+                )
+
+    def units(self, gas: Gas) -> Units:
+        """Return the diameter and the thermal speed as units."""
+        speed = jnp.sqrt(gas.temperature)
+        return Units.from_gas(gas, self.num_particles, gas.diameter, speed)
+
+    def differentiable(
+        self, run: Callable[..., Result], shifted: Callable[..., Result]
+    ) -> Callable[..., Result]:
+        """Return runs with projected derivatives, with differences of runs, or unchanged."""
+        if not self.projected:
+            return run
+        if self.differences is not None:
+            run = by_differences(run, shifted, self.differences)
+        return differentiable(
+            run,
+            material=lambda scene: scene.material,
+            frequency=lambda scene: scene.collision_frequency,
+            refused=self.refused_derivatives,
+        )
+
+    def dynamics(
+        self, scene: SphereScene, dimension: int, replicas: int, traced: bool = False
+    ) -> AbstractSphereDynamics:
+        """Return the motion of the spheres, with arrays of the sizes that it needs."""
+        sizes = self._known_sizes(scene, dimension, replicas)
+        engine = choose_engine(self.neighbours, sizes.engine, traced=traced)
+        if traced and engine == "jax-md":
+            raise ValueError(
+                'inside jax.jit or jax.vmap neighbours="jax-md" is not supported, since it sizes '
+                "its cells from known numbers: leave neighbours out"
+            )
+        return self.motion(scene, (replicas, self.num_particles, dimension), sizes, engine)
+
+    def merged(
+        self, dimension: int, scene: SphereScene, differs: SphereScene, members: int
+    ) -> AbstractSphereDynamics | None:
+        """Return the motion of members that differ in their law alone; None for all others."""
+        sizes = None if self._sizes is None else self._sizes.of_batch
+        if sizes is None or not _differs_in_law_alone(differs):
+            return None
+        replicas = members * self.replicas
+
+        def of_replicas(x: Array, is_batched: bool) -> Array:
+            if is_batched:
+                return jnp.repeat(x, self.replicas, axis=0)
+            return jnp.broadcast_to(x, (replicas, *jnp.shape(x)))
+
+        laws = jax.tree.map(of_replicas, scene.material.law, differs.material.law)
+        law = self.laws_of_replicas(laws, differs.material.law)
+        if law is None:
+            return None
+        together = scene._replace(
+            contact_duration=jnp.min(scene.contact_duration),
+            material=scene.material._replace(law=law),
+        )
+        multiple = math.ceil(members / SIZED_MEMBERS)
+        longer = sizes._replace(capacity=sizes.capacity.of_members(multiple))
+        engine = choose_engine(self.neighbours, sizes.engine, traced=True)
+        return self.motion(together, (replicas, self.num_particles, dimension), longer, engine)
+
+
+def _differs_in_law_alone(differs: SphereScene) -> bool:
+    """Return whether members of a batch, whose scene has True at what differs, can share arrays.
+
+    The contact duration follows from the law.
+    """
+    material = differs.material._replace(law=None)
+    others = differs._replace(material=material, contact_duration=False)
+    return not any(jax.tree.leaves(others))

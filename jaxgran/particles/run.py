@@ -46,10 +46,9 @@ from jaxgran.data import checkpoint
 from jaxgran.data.curve import Run
 from jaxgran.data.particles import Sphere, Trajectory
 from jaxgran.gradients.rule import Records, Result
-from jaxgran.particles import snapshot
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import AbstractDynamics, AbstractProcess
-from jaxgran.particles.snapshot import Units
+from jaxgran.particles.snapshot import Units, apply_save
 
 CHECKPOINT_SECONDS = 60.0
 """Time between checkpoints; one more is written when a run is interrupted."""
@@ -100,8 +99,8 @@ class Recorder(eqx.Module):
         failed = jnp.broadcast_to(state.status != status.OK, dynamics.shape[:1])
         if self.save is not None:
             arrays = dynamics.to_lab_frame(state)
-            particles = snapshot.to_particles(self.units, dynamics.shape[0], *arrays)
-            saved = snapshot.apply_save(self.save, particles)
+            particles = self.units.to_particles(dynamics.shape[0], *arrays)
+            saved = apply_save(self.save, particles)
             saved = jax.tree.map(partial(nan_where, failed), saved)
         # Replicas are the last axis of all others.
         one_or_nan = jnp.where(failed, jnp.nan, 1.0)  # a factor: derivatives are nan, too
@@ -548,7 +547,7 @@ def _writer(
     def write(k: int, state: Any) -> None:
         arrays = loop.each(_to_lab_frame, dynamics, state)
         joined = jax.tree.map(lambda x: _joined(np.asarray(x), 0, groups), arrays)
-        particles = snapshot.to_particles(units, replicas, *joined)
+        particles = units.to_particles(replicas, *joined)
         trajectory.write(k, float(seconds[k]), particles, sphere)
 
     return write

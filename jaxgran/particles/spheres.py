@@ -21,7 +21,8 @@ from jaxgran._utils import status
 from jaxgran.particles import observables
 from jaxgran.particles.capacity import Capacity, skin_for_pairs
 from jaxgran.particles.dynamics import AbstractDynamics, advance_time, time_left
-from jaxgran.particles.neighbours.lists import ListedPairs, Pairs, search_pairs, with_offsets, wrap
+from jaxgran.particles.neighbours.lists import search_pairs
+from jaxgran.particles.neighbours.pairs import ListedPairs, Pairs, with_offsets, wrap
 from jaxgran.particles.start import (
     Placement,
     PlacementState,
@@ -116,7 +117,8 @@ class Segment(NamedTuple):
         state: state after the last block (window) that succeeded, with the status of the last one
             and the largest number of rows needed.
         stale: whether a new neighbour list is needed.
-        retry: what soft or hard spheres change when they repeat a block.
+        retry: what soft or hard spheres change when they repeat a block: a factor on the bound of
+            speeds (hard), `SoftRetry` (soft).
     """
 
     state: SphereState
@@ -158,7 +160,12 @@ class AbstractSphereDynamics(AbstractDynamics):
 
     @abstractmethod
     def prepare(self, state: SphereState, end: ArrayLike) -> tuple[SphereState, Array, Array]:
-        """Return the state for a new neighbour list, the positions to list, and its last time."""
+        """Prepare a new neighbour list.
+
+        Returns:
+            The state with wrapped positions, the positions for which the list is built, and the
+            time until which it is used, at most `end`.
+        """
 
     @abstractmethod
     def run_blocks(
@@ -177,6 +184,10 @@ class AbstractSphereDynamics(AbstractDynamics):
         Returns:
             The state, whose status has the faults that cannot be avoided.
         """
+
+    @abstractmethod
+    def true_velocities(self, state: SphereState) -> tuple[Array, Array | None]:
+        """Return true velocities and spins from stored ones; None without spins."""
 
     @property
     def replicas(self) -> int:
@@ -201,11 +212,11 @@ class AbstractSphereDynamics(AbstractDynamics):
 
     def random_start(self, key: Any, each: Callable, reach: Callable) -> Any:
         """Return the positions and velocities of a fluid, after elastic motion, and the status."""
-        frequency = self.scene.collision_frequency
+        placed = reach([(self.placement(), 0.0)], each(_begin_placement, self, key))
         elastic = self.elastic()
         crowded = elastic.with_capacity(self.equilibration_capacity)
-        placed = reach([(self.placement(), 0.0)], each(_begin_placement, self, key))
         state = each(_begin_equilibration, crowded, (placed, key))
+        frequency = self.scene.collision_frequency
         end = jnp.minimum(EQUILIBRATION_COLLISIONS / frequency, MAX_EQUILIBRATION)
         settled = jnp.minimum(SETTLING_COLLISIONS / frequency, end)
         state = reach([(crowded, settled), (elastic, end)], state)
@@ -214,11 +225,10 @@ class AbstractSphereDynamics(AbstractDynamics):
     @property
     def equilibrium(self) -> Any:
         """Elastic spheres of no law, with what equilibrates them."""
-        elastic = self.elastic()
-        return elastic.described()
+        return self.elastic().described()
 
     def with_new_velocities(self, start: Any, key: PRNGKeyArray) -> Any:
-        """Return a fluid at the same places: in equilibrium velocities do not depend on them."""
+        """Return a start at the same places: in equilibrium velocities do not depend on them."""
         position, _ = start
         return position, _first_velocities(key, self.shape)
 
@@ -241,7 +251,7 @@ class AbstractSphereDynamics(AbstractDynamics):
         drift = jnp.zeros((self.replicas, position.shape[1]), dtype)
         if self.scene.galilean_invariant:
             drift = jnp.mean(by_replica(velocity, self.replicas), axis=1)
-            velocity = velocity - self.of_spheres(drift)
+            velocity = velocity - self.by_sphere(drift)
         state = SphereState(
             time=jnp.zeros((), dtype),
             time_rest=jnp.zeros((), dtype),
@@ -265,8 +275,8 @@ class AbstractSphereDynamics(AbstractDynamics):
             return state
         return state._replace(tangents=self.initial_tangents(state, directions))
 
-    def of_spheres(self, values: Float[Array, "replicas d"]) -> Float[Array, "n d"]:
-        """Return values of each replica for each of its spheres."""
+    def by_sphere(self, values: Float[Array, "replicas d"]) -> Float[Array, "n d"]:
+        """Return values of replicas, repeated for each of their spheres."""
         return jnp.repeat(values, self.shape[1], axis=0)
 
     def unfinished(self, state: SphereState, until: ArrayLike) -> Bool[Array, ""]:
@@ -294,25 +304,32 @@ class AbstractSphereDynamics(AbstractDynamics):
         If the status of the result is not ok, recovery was not possible: an array is too short, a
         number is not finite, or a step cannot become shorter. The state is then the given one.
         """
-        before, listed, end = self.prepare(state, until)
-        cutoff = 1 + before.skin
-        sizes = self.capacity[:2]
-        found = search_pairs(listed, self.scene.side, cutoff, self.replicas, sizes, self.engine)
-        return self._run_until_stale(state, before, listed, found, end)
+        prepared, listed, end = self.prepare(state, until)
+        found = search_pairs(
+            listed,
+            self.scene.side,
+            1 + prepared.skin,
+            replicas=self.replicas,
+            capacity=self.capacity.pairs,
+            ahead=self.capacity.lookahead,
+            engine=self.engine,
+        )
+        return self._run_until_stale(state, prepared, listed, found, end)
 
     @jax.jit
     def _run_until_stale(
         self,
         given: SphereState,
-        before: SphereState,
-        listed: Array,
+        prepared: SphereState,
+        listed: Float[Array, "n d"],
         found: ListedPairs,
         end: ArrayLike,
     ) -> SphereState:
+        """Run the blocks of a segment; the given state returns after a failure."""
         pairs = with_offsets(listed, self.scene.side, found)
         needed = jnp.zeros_like(given.needed).at[:2].set(jnp.stack([pairs.count, pairs.lookahead]))
-        before = before._replace(status=self.capacity.exceeded_by(needed), needed=needed)
-        state = self.recover(self.run_blocks(before, listed, pairs, end), before)
+        prepared = prepared._replace(status=self.capacity.exceeded_by(needed), needed=needed)
+        state = self.recover(self.run_blocks(prepared, listed, pairs, end), prepared)
         fault = state.status
         needed = state.needed
         advanced = elapsed(given, state) > min_duration(given)
@@ -324,14 +341,10 @@ class AbstractSphereDynamics(AbstractDynamics):
         return state._replace(stalled=stalled, status=fault, needed=needed)
 
     def to_lab_frame(self, state: SphereState) -> tuple[Array, Array, Array | None]:
-        drift = self.of_spheres(state.drift)
+        drift = self.by_sphere(state.drift)
         position = wrap(self.scene.side, state.position + drift * state.time)
         velocity, spin = self.true_velocities(state)
         return position, velocity + drift, spin
-
-    @abstractmethod
-    def true_velocities(self, state: SphereState) -> tuple[Array, Array | None]:
-        """Return true velocities and spins from stored ones; None without spins."""
 
     def invalid_block(self, new: SphereState, needed: Int[Array, "kinds"]) -> Int[Array, ""]:
         """Return the status of a block that lacks pairs or particles, or is not finite."""
@@ -460,10 +473,10 @@ def fastest(velocity: Float[Array, "n d"], replicas: int) -> Float[Array, "repli
 def common_values(
     state: SphereState, scene: SphereScene, replicas: int
 ) -> tuple[dict[str, Array], Float[Array, "replicas N d"]]:
-    """Return the records that soft and hard spheres share, and velocities.
+    """Return the records that soft and hard spheres share, and peculiar velocities.
 
-    They are relative to the centre of mass, between walls relative to the walls. Walls bound
-    displacements, and there are no periodic waves between them: these records are left out.
+    Walls bound displacements, and there are no periodic waves between them: these records are left
+    out.
     """
     velocity = peculiar_velocity(scene, state.velocity, replicas)
     first = peculiar_velocity(scene, state.first_velocity, replicas)

@@ -18,7 +18,8 @@ from jaxgran._utils.tracing import any_traced
 from jaxgran.data.curve import Particles
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import AbstractProcess
-from jaxgran.particles.neighbours.lists import search_pairs, with_offsets, wrap
+from jaxgran.particles.neighbours.lists import search_pairs
+from jaxgran.particles.neighbours.pairs import with_offsets, wrap
 from jaxgran.particles.snapshot import box_side
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS, Walls
 from jaxgran.scene.gas import Gas
@@ -167,8 +168,15 @@ class Placement(AbstractProcess):
         side = self.side
         replicas, num_particles, dimension = self.shape
         built = wrap(side, state.position)
-        cutoff = 1 + self.skin
-        listed = search_pairs(built, side, cutoff, replicas, self.capacity[:2], self.engine)
+        listed = search_pairs(
+            built,
+            side,
+            1 + self.skin,
+            replicas=replicas,
+            capacity=self.capacity.pairs,
+            ahead=self.capacity.lookahead,
+            engine=self.engine,
+        )
         pairs = with_offsets(built, side, listed)
         needed = jnp.zeros_like(state.needed).at[:2].set(jnp.stack([pairs.count, pairs.lookahead]))
         full = self.capacity.exceeded_by(needed)

@@ -1,5 +1,6 @@
 """Contact of two viscoelastic spheres: the normal force, and the solution of one impact."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -77,10 +78,10 @@ def contact_force(
     touching = xi > 0
     root = jnp.sqrt(jnp.where(touching, xi, 1.0))
     # F over rho sqrt(xi); a contact between spheres without adhesion ends where it is 0.
-    normal_stress = xi + 1.5 * jnp.asarray(dissipative_constant) * jnp.asarray(overlap_rate)
+    scaled_force = xi + 1.5 * jnp.asarray(dissipative_constant) * jnp.asarray(overlap_rate)
     if clipped:
-        normal_stress = jnp.maximum(normal_stress, 0.0)
-    return jnp.where(touching, elastic_constant * root * normal_stress, 0.0)
+        scaled_force = jnp.maximum(scaled_force, 0.0)
+    return jnp.where(touching, elastic_constant * root * scaled_force, 0.0)
 
 
 def midpoint_rate(
@@ -132,59 +133,6 @@ class Impact(NamedTuple):
     largest_overlap: Float[Array, ""]
 
 
-def _rates(state, beta):
-    # xi = X y^2 and dt = (X/v) 2 y ds turn xi'' = -sqrt(xi) (xi + beta xi') into polynomials.
-    y, w, _ = state
-    return w, -2 * y * y * (y * y + beta * w), 2 * y
-
-
-def _scaled_stress(state, beta):
-    # sqrt(xi) - sqrt(-beta w) has the same root as the stress xi + beta w, and always a simple one.
-    y, w, _ = state
-    attraction = jnp.maximum(-beta * w, 0.0)
-    positive = attraction > 0
-    return y - jnp.where(positive, jnp.sqrt(jnp.where(positive, attraction, 1.0)), 0.0)
-
-
-def _integrate_to_zero(end, beta, state, smallest, rtol, max_steps):
-    """Integrate the state of an impact until `end(state, beta)` is 0."""
-    solve = partial(
-        diffrax.diffeqsolve,
-        solver=diffrax.Dopri8(),
-        dt0=None,
-        args=beta,
-        adjoint=diffrax.ForwardMode(),
-        max_steps=max_steps,
-    )
-    controller = diffrax.PIDController(rtol=rtol, atol=rtol * smallest, dtmax=0.25 + beta)
-    overshot = solve(
-        diffrax.ODETerm(lambda s, y, beta: _rates(y, beta)),
-        t0=0.0,
-        t1=jnp.inf,
-        y0=state,
-        stepsize_controller=controller,
-        event=diffrax.Event(lambda t, y, args, **_: end(y, args) <= 0),
-    )
-    state = jax.tree.map(lambda leaf: leaf[-1], overshot.ys)
-
-    # The event stops the solver up to one step after the root. A second integration, backwards with
-    # `end` as the independent variable, reaches the root within the tolerance of the solver and
-    # needs no interpolation (Henon, Physica D 5, 412 (1982)).
-    def rates_per_end(_, state, beta):
-        rates = _rates(state, beta)
-        _, slope = jax.jvp(lambda state: end(state, beta), (state,), (rates,))
-        return jax.tree.map(lambda rate: rate / slope, rates)
-
-    exact = solve(
-        diffrax.ODETerm(rates_per_end),
-        t0=end(state, beta),
-        t1=0.0,
-        y0=state,
-        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol * smallest),
-    )
-    return jax.tree.map(lambda leaf: leaf[-1], exact.ys)
-
-
 def impact(
     beta: ArrayLike, *, clipped: bool = True, rtol: float = 1e-11, max_steps: int = 1_000_000
 ) -> Impact:
@@ -221,11 +169,87 @@ def impact(
     rtol = max(rtol, 10 * float(jnp.finfo(beta.dtype).eps))
     zero = jnp.zeros_like(beta)
     one = jnp.ones_like(beta)
-
     # Order of magnitude of the rebound speed; the absolute tolerance must be much smaller.
-    smallest = (1 + jax.lax.stop_gradient(beta)) ** (-5 / 3 if clipped else -5)
-    solve = partial(_integrate_to_zero, smallest=smallest, rtol=rtol, max_steps=max_steps)
-    y, _, half_time = solve(lambda state, beta: state[1], beta, (zero, one, zero))
-    separation = _scaled_stress if clipped else lambda state, beta: state[0]
-    _, w, time = solve(separation, beta, (y, zero, half_time))
-    return Impact(restitution=-w, duration=time, largest_overlap=y * y)
+    rebound_speed = (1 + jax.lax.stop_gradient(beta)) ** (-5 / 3 if clipped else -5)
+    integrate = partial(
+        _integrate_until, beta=beta, rtol=rtol, atol=rtol * rebound_speed, max_steps=max_steps
+    )
+    compressed = integrate(lambda state, beta: state.w, ContactState(y=zero, w=one, time=zero))
+    separation = _scaled_stress if clipped else lambda state, beta: state.y
+    # Exactly 0, and not only within the tolerance.
+    parted = integrate(separation, compressed._replace(w=zero))
+    largest_overlap = compressed.y * compressed.y
+    return Impact(restitution=-parted.w, duration=parted.time, largest_overlap=largest_overlap)
+
+
+class ContactState(NamedTuple):
+    """State within an impact, in the variables of `impact`.
+
+    Attributes:
+        y: root of the overlap over X.
+        w: derivative of y in s.
+        time: since first contact, in X/v.
+    """
+
+    y: Float[Array, ""]
+    w: Float[Array, ""]
+    time: Float[Array, ""]
+
+
+def _rates(state: ContactState, beta: Float[Array, ""]) -> ContactState:
+    # xi = X y^2 and dt = (X/v) 2 y ds turn xi'' = -sqrt(xi) (xi + beta xi') into polynomials.
+    y, w, _ = state
+    return ContactState(y=w, w=-2 * y * y * (y * y + beta * w), time=2 * y)
+
+
+def _scaled_stress(state: ContactState, beta: Float[Array, ""]) -> Float[Array, ""]:
+    # sqrt(xi) - sqrt(-beta w) has the same root as the stress xi + beta w, and always a simple one.
+    attraction = jnp.maximum(-beta * state.w, 0.0)
+    positive = attraction > 0
+    return state.y - jnp.where(positive, jnp.sqrt(jnp.where(positive, attraction, 1.0)), 0.0)
+
+
+def _integrate_until(
+    end: Callable[[ContactState, Array], Array],
+    state: ContactState,
+    *,
+    beta: Float[Array, ""],
+    rtol: float,
+    atol: Float[Array, ""],
+    max_steps: int,
+) -> ContactState:
+    """Integrate the state of an impact until `end(state, beta)` is 0."""
+    solve = partial(
+        diffrax.diffeqsolve,
+        solver=diffrax.Dopri8(),
+        dt0=None,
+        args=beta,
+        adjoint=diffrax.ForwardMode(),
+        max_steps=max_steps,
+    )
+    overshot = solve(
+        diffrax.ODETerm(lambda s, state, beta: _rates(state, beta)),
+        t0=0.0,
+        t1=jnp.inf,
+        y0=state,
+        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=atol, dtmax=0.25 + beta),
+        event=diffrax.Event(lambda t, y, args, **_: end(y, args) <= 0),
+    )
+    beyond = jax.tree.map(lambda leaf: leaf[-1], overshot.ys)
+
+    # The event stops the solver up to one step after the root. A second integration, backwards with
+    # `end` as the independent variable, reaches the root within the tolerance of the solver and
+    # needs no interpolation (Henon, Physica D 5, 412 (1982)).
+    def rates_per_end(_, state: ContactState, beta: Float[Array, ""]) -> ContactState:
+        rates = _rates(state, beta)
+        _, slope = jax.jvp(lambda state: end(state, beta), (state,), (rates,))
+        return jax.tree.map(lambda rate: rate / slope, rates)
+
+    exact = solve(
+        diffrax.ODETerm(rates_per_end),
+        t0=end(beyond, beta),
+        t1=0.0,
+        y0=beyond,
+        stepsize_controller=diffrax.PIDController(rtol=rtol, atol=atol),
+    )
+    return jax.tree.map(lambda leaf: leaf[-1], exact.ys)

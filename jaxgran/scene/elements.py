@@ -4,7 +4,6 @@ Each element is an optional field of `Gas`. The compiled program of a gas withou
 not contain it. `wall_impact_ratio` describes the gas near a wall that dissipates energy.
 """
 
-from collections.abc import Callable
 from math import pi, sqrt
 from typing import Any, ClassVar
 
@@ -17,17 +16,16 @@ from jaxgran._utils.tracing import is_known
 from jaxgran._utils.validation import FRACTION, Domain
 from jaxgran.scene.geometry import MIN_BOX
 from jaxgran.scene.laws import ConstantRestitution, RestitutionLaw
-from jaxgran.scene.parameters import ADVICE, Parameter, fields_of, number_named
+from jaxgran.scene.parameters import (
+    ADVICE,
+    Parameter,
+    fields_of,
+    number_named,
+    optional_number_named,
+)
 
 NUM_SPIN_COMPONENTS = {2: 1, 3: 3}
 """Number of components of the angular velocity, d_rot, by dimension."""
-
-
-def _number_or_none(name: str) -> Callable[[Any], Array | None]:
-    def convert(value: Any) -> Array | None:
-        return None if value is None else number_named(name)(value)
-
-    return convert
 
 
 class Element(eqx.Module):
@@ -96,7 +94,7 @@ class Rough(Element):
         converter=number_named("rotational_temperature"), default=0.0
     )
     friction: Float[Array, ""] | None = eqx.field(
-        converter=_number_or_none("friction"), default=None
+        converter=optional_number_named("friction"), default=None
     )
 
 
@@ -182,13 +180,17 @@ class Walls(Element):
     side: Float[Array, "..."] = eqx.field(converter=number_named("side of the walls"))
     restitution: RestitutionLaw = eqx.field(converter=_wall_law, kw_only=True)
     tangential_restitution: Float[Array, ""] | None = eqx.field(
-        converter=_number_or_none("tangential_restitution of the walls"), default=None, kw_only=True
+        converter=optional_number_named("tangential_restitution of the walls"),
+        default=None,
+        kw_only=True,
     )
     tangential_damping: Float[Array, ""] | None = eqx.field(
-        converter=_number_or_none("tangential_damping of the walls"), default=None, kw_only=True
+        converter=optional_number_named("tangential_damping of the walls"),
+        default=None,
+        kw_only=True,
     )
     friction: Float[Array, ""] | None = eqx.field(
-        converter=_number_or_none("friction of the walls"), default=None, kw_only=True
+        converter=optional_number_named("friction of the walls"), default=None, kw_only=True
     )
 
     part: ClassVar[str] = " of the walls"

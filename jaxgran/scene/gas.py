@@ -1,8 +1,8 @@
-"""The scene: a homogeneous gas of spheres and its physical scales."""
+"""A homogeneous gas of spheres: its parameters, its elements, and its physical scales."""
 
 from functools import cached_property
 from math import gamma, pi
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,47 +12,29 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxgran._utils.formatting import format_quantity, text_table
-from jaxgran._utils.validation import (
-    ANY,
-    POSITIVE,
-    Domain,
-    UserNumber,
-    checked_int,
-    float_array,
-)
+from jaxgran._utils.validation import POSITIVE, Domain, UserNumber, checked_int, float_array
 from jaxgran.scene import elements, laws
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME, ELASTIC_OVERLAP
-from jaxgran.scene.geometry import (
-    CLOSE_PACKING,
-    contact_value,
-    impact_average,
-    sphere_surface,
+from jaxgran.scene.geometry import CLOSE_PACKING, contact_value, sphere_surface
+from jaxgran.scene.parameter_fields import (
+    ParameterField,
+    element_fields,
+    fields_by_name,
+    law_fields,
 )
 from jaxgran.scene.parameters import (
     ADVICE,
     PARAMETER_UNITS,
-    PREFIXES,
     domains_of,
     fields_of,
     number_named,
+    optional_number_named,
     unit_of,
 )
+from jaxgran.scene.shear_instability import scaled_critical_wavenumber
 
-
-class ParameterField(NamedTuple):
-    """Path to a parameter, of attributes (str) and items (tuples of one key), and its range."""
-
-    path: tuple[Any, ...]
-    domain: Domain
-
-    def get(self, module: Any) -> Any:
-        """Return the parameter of a module."""
-        for key in self.path:
-            module = getattr(module, key) if isinstance(key, str) else module[key[0]]
-        return module
-
-
-_PACKING_DOMAINS = {d: Domain(0.0, close) for d, close in CLOSE_PACKING.items()}
+PACKING_DOMAINS = {d: Domain(0.0, close) for d, close in CLOSE_PACKING.items()}
+"""Allowed packing fractions, by dimension."""
 
 
 def _checked_law(law: laws.RestitutionLaw) -> laws.RestitutionLaw:
@@ -71,21 +53,6 @@ def _without_function_leaf(leaf: Any) -> Any:
             "field as eqx.field(static=True)"
         )
     return jax.tree_util.Partial(leaf) if callable(leaf) else leaf
-
-
-def law_fields(law: laws.RestitutionLaw) -> dict[str, ParameterField]:
-    """Path and range of the parameters of a law: those in its `domains`, then all further arrays.
-
-    The name of an array in a part of the law is its path, "net.layers[0].weight".
-    """
-    fields = {name: ParameterField((name,), domain) for name, domain in law.domains.items()}
-    for keys, leaf in jax.tree_util.tree_flatten_with_path(law)[0]:
-        name = jax.tree_util.keystr(keys).removeprefix(".")
-        if name not in (*fields, *law.constants) and eqx.is_inexact_array(leaf):
-            items = [(getattr(k, "idx", getattr(k, "key", None)),) for k in keys]
-            path = [getattr(k, "name", item) for k, item in zip(keys, items, strict=True)]
-            fields[name] = ParameterField(tuple(path), ANY)
-    return fields
 
 
 ELEMENTS: dict[str, tuple[type, ...]] = {
@@ -117,12 +84,6 @@ MAX_SIZE_SPREAD = 0.2
 def is_allowed_spread(spread: Any) -> Any:
     """Return whether the theory of unequal sizes holds at a spread of diameters over their mean."""
     return spread <= MAX_SIZE_SPREAD * (1 + 1e-6)
-
-
-def _optional_number(name: str) -> Any:
-    """Return the converter of a field that is a number or None."""
-    converter = number_named(name)
-    return lambda value: None if value is None else converter(value)
 
 
 class Gas(eqx.Module):
@@ -172,7 +133,7 @@ class Gas(eqx.Module):
     temperature: Float[Array, ""] = eqx.field(converter=number_named("temperature"), kw_only=True)
     dimension: int = eqx.field(static=True, default=3, kw_only=True)
     diameter_sd: Float[Array, ""] | None = eqx.field(
-        converter=_optional_number("diameter_sd"), default=None, kw_only=True
+        converter=optional_number_named("diameter_sd"), default=None, kw_only=True
     )
     surface: elements.Rough | elements.Frictional | None = optional_element("surface")
     container: elements.Walls | None = optional_element("container")
@@ -260,28 +221,29 @@ class Gas(eqx.Module):
 
     @cached_property
     def _parameter_fields(self) -> dict[str, ParameterField]:
-        gas_domains = domains_of("Gas") | {"packing_fraction": _PACKING_DOMAINS[self.dimension]}
+        own = domains_of("Gas") | {"packing_fraction": PACKING_DOMAINS[self.dimension]}
         if self.diameter_sd is None:
-            del gas_domains["diameter_sd"]
-        law = law_fields(self.law).items()
-        fields = {name: ParameterField(("law", *path), domain) for name, (path, domain) in law}
-        fields |= {name: ParameterField((name,), domain) for name, domain in gas_domains.items()}
-        parts: list[tuple[Any, Any]] = [((name,), getattr(self, name)) for name in ELEMENTS]
-        if self.container is not None:
-            parts.insert(2, (("container", "restitution"), self.container.restitution))
-        for path, part in parts:
-            prefix = PREFIXES.get(type(getattr(self, path[0])).__name__, "")
-            for name, domain in ({} if part is None else part.domains).items():
-                fields[prefix + name] = ParameterField((*path, name), domain)
+            del own["diameter_sd"]
+        of_law = law_fields(self.law)
+        fields = {name: field.within("law") for name, field in of_law.items()}
+        fields |= fields_by_name(own)
+        for element in ELEMENTS:
+            if getattr(self, element) is not None:
+                of_element = element_fields(getattr(self, element))
+                fields |= {name: field.within(element) for name, field in of_element.items()}
         return fields
 
     @property
     def elements(self) -> tuple[str, ...]:
-        """Names of the elements of this gas; "friction" stands for a `Frictional` surface, and
-        diameter_sd is one of them."""
+        """Names of the elements of this gas, which include diameter_sd.
+
+        A `Frictional` surface has the name "friction", a `Rough` one "surface".
+        """
         names = (*ELEMENTS, "diameter_sd")
-        given = tuple(name for name in names if getattr(self, name) is not None)
-        return ("friction", *given[1:]) if isinstance(self.surface, elements.Frictional) else given
+        given = [name for name in names if getattr(self, name) is not None]
+        if isinstance(self.surface, elements.Frictional):
+            given[given.index("surface")] = "friction"
+        return tuple(given)
 
     def check_single(self) -> None:
         """Check that this is one gas, not a batch of gases outside of `jax.vmap`.
@@ -327,11 +289,10 @@ class Gas(eqx.Module):
     @property
     def number_density(self) -> Float[Array, ""]:
         """Number density n, m^-d."""
-        volume_of_sphere = (
-            sphere_surface(self.dimension) / self.dimension * (self.diameter / 2) ** self.dimension
-        )
-        if self.diameter_sd is not None:
-            unequal = 1 + (2 * self.dimension - 3) * self.size_spread**2
+        d = self.dimension
+        volume_of_sphere = sphere_surface(d) / d * (self.diameter / 2) ** d
+        if self.diameter_sd is not None:  # <sigma^d> over <sigma>^d
+            unequal = 1 + (2 * d - 3) * self.size_spread**2
             volume_of_sphere = volume_of_sphere * unequal
         return self.packing_fraction / volume_of_sphere
 
@@ -358,8 +319,10 @@ class Gas(eqx.Module):
 
     @property
     def mean_free_path(self) -> Float[Array, ""]:
-        """Mean free path, m: ``1 / (sqrt(2) pi n g_2 sigma^2)`` (3D) or
-        ``1 / (2 sqrt(2) n g_2 sigma)`` (2D)."""
+        """Mean free path, m.
+
+        ``1 / (sqrt(2) pi n g_2 sigma^2)`` (3D) or ``1 / (2 sqrt(2) n g_2 sigma)`` (2D).
+        """
         return self.path_length / (2**0.5 * (pi if self.dimension == 3 else 2))
 
     @property
@@ -416,8 +379,10 @@ class Gas(eqx.Module):
 
     @property
     def delta(self) -> Float[Array, ""]:
-        """Small parameter of the paper, ``delta = A alpha^(2/5) T_0^(1/10)``; viscoelastic spheres
-        only."""
+        """Small parameter of the paper; viscoelastic spheres only.
+
+        ``delta = A alpha^(2/5) T_0^(1/10)``, dimensionless.
+        """
         law = self._viscoelastic("delta")
         return law.dissipative_constant * self.alpha**0.4 * self.temperature**0.1
 
@@ -467,7 +432,7 @@ class Gas(eqx.Module):
         ``k_c sigma = n sigma^3 sqrt((32 pi/15) I f)`` (3D) or ``n sigma^2 sqrt(pi I f)`` (2D). Here
         ``I = <1 - eps^2>`` is weighted by the energy of the normal motion, and the density factor
         ``f = g_2^2/(1 + a_1 y + a_2 y^2)`` follows from Enskog's viscosity of elastic spheres in
-        the first Sonine approximation (see `SHEAR_VISCOSITY`).
+        the first Sonine approximation (see `jaxgran.scene.shear_instability`).
 
         In a periodic box longer than L_c a flow grows relative to the thermal motion. Clusters form
         later, when the flow is strong enough to sweep the spheres together. In two-dimensional
@@ -477,7 +442,7 @@ class Gas(eqx.Module):
         (``experiments/paper/paper_clustering.py``). In shorter boxes this happens later or never.
         L_c is infinite for elastic spheres.
         """
-        loss = mean_loss(self.reduced_law, self.packing_fraction)
+        loss = laws.mean_loss(self.reduced_law, self.packing_fraction)
         inelastic = loss > 0
         wavenumber = scaled_critical_wavenumber(self.packing_fraction, self.dimension)
         root = wavenumber * jnp.sqrt(jnp.where(inelastic, loss, 1.0))
@@ -501,40 +466,3 @@ def _restitution(gas: Gas, normal_speed: Float[Array, "..."]) -> Float[Array, ".
     one = jnp.ones_like(gas.temperature)
     law = gas.law.reduced(diameter=gas.diameter, mass=gas.mass, speed=one)
     return law.restitution(normal_speed)
-
-
-SHEAR_VISCOSITY = {2: (2.0, 1.0, 0.8729), 3: (4.0, 0.8, 0.7614)}
-"""Coefficients b, a_1, a_2 of Enskog's shear viscosity, by dimension.
-
-``eta g_2 / eta_0 = 1 + a_1 y + a_2 y^2`` with ``y = b phi g_2``.
-
-Reference: Gass 1971 (2D); Chapman & Cowling, Eq. 16.41.7 (3D).
-"""
-
-
-def scaled_critical_wavenumber(
-    packing_fraction: Float[Array, ""], dimension: int
-) -> Float[Array, ""]:
-    """Critical wavenumber ``k_c sigma/sqrt(I)``, with I = <1 - eps^2>; see `Gas.critical_box`."""
-    g_2 = contact_value(packing_fraction, dimension)
-    phi = packing_fraction
-    b, first, second = SHEAR_VISCOSITY[dimension]
-    y = b * phi * g_2
-    dense = g_2**2 / (1 + first * y + second * y**2)
-    density = phi * dimension * 2**dimension / sphere_surface(dimension)
-    return density * jnp.sqrt((32 * pi / 15 if dimension == 3 else pi) * dense)
-
-
-def mean_loss(law: laws.ReducedLaw, like: Float[Array, ""]) -> Float[Array, ""]:
-    """Mean loss ``I = <1 - eps^2>``, weighted by the energy of the normal motion.
-
-    Args:
-        law: law of restitution; the average is taken at its reference speed.
-        like: a number whose dtype the result has.
-    """
-
-    def weighted_loss(g: Array) -> Array:
-        loss = law.loss(g)
-        return g**2 / 2 * loss * (2 - loss)
-
-    return impact_average(weighted_loss, like)

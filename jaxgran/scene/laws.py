@@ -28,6 +28,7 @@ from jaxgran._utils.validation import (
     float_array,
 )
 from jaxgran.scene import contact
+from jaxgran.scene.geometry import impact_average
 from jaxgran.scene.parameters import ADVICE, domains_of, number_named
 
 _UNITS_ADVICE = (
@@ -739,3 +740,18 @@ def _typical_shares(speeds: Any) -> Any:
     """Return the drops of ``L = (v/v_last)^(1/5)`` at some speeds."""
     xp = jnp if isinstance(speeds, jax.Array) else np
     return xp.diff((speeds / speeds[-1]) ** 0.2, prepend=0.0)
+
+
+def mean_loss(law: ReducedLaw, like: Float[Array, ""]) -> Float[Array, ""]:
+    """Mean loss ``I = <1 - eps^2>``, weighted by the energy of the normal motion.
+
+    Args:
+        law: law of restitution; the average is taken at its reference speed.
+        like: a number whose dtype the result has.
+    """
+
+    def weighted_loss(g: Array) -> Array:
+        loss = law.loss(g)
+        return g**2 / 2 * loss * (2 - loss)
+
+    return impact_average(weighted_loss, like)

@@ -125,6 +125,12 @@ def number_named(name: str) -> Callable[[Any], Any]:
     return validation.number_named(name, unit_of(name))
 
 
+def optional_number_named(name: str) -> Callable[[Any], Any]:
+    """Return the same converter for a field that is a number or None."""
+    converter = number_named(name)
+    return lambda value: None if value is None else converter(value)
+
+
 def fields_of(owner: str) -> dict[str, Parameter]:
     """Return the parameters that are fields of a class, by the name of the field."""
     prefix = PREFIXES.get(owner, "")

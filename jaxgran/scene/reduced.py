@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxgran.scene import elements, laws
-from jaxgran.scene.gas import Gas, mean_loss
+from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import pair_contact_value
 
 
@@ -262,7 +262,7 @@ class SphereScene(NamedTuple):
         law = material.law
         if isinstance(law, ReducedContact):
             return jnp.log(law.dissipative_constant) + 0.4 * jnp.log(law.alpha)
-        lost = mean_loss(law, self.side)
+        lost = laws.mean_loss(law, self.side)
         return jnp.log(lost) - jnp.log1p(-lost)
 
 

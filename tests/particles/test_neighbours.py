@@ -7,23 +7,29 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from jaxgran.particles.neighbours.cells import cells, expected_run
+from jaxgran.particles.neighbours.cells import expected_run, pairs_by_cells
 from jaxgran.particles.neighbours.lists import (
     MAX_LOOKAHEAD,
     check_engine,
     choose_engine,
     compiled_engine,
     search_pairs,
-    with_offsets,
-    wrap,
 )
-from jaxgran.particles.neighbours.sweep import sweep
+from jaxgran.particles.neighbours.pairs import with_offsets, wrap
+from jaxgran.particles.neighbours.sweep import pairs_by_sweep
 
 
 def find_pairs(position, side, cutoff, *, replicas=1, capacity, by="cells"):
     """All pairs with their offsets; a sweep may look ahead over all particles of a replica."""
-    capacities = capacity, len(position) // replicas
-    pairs = search_pairs(position, side, cutoff, replicas, capacities, by)
+    pairs = search_pairs(
+        position,
+        side,
+        cutoff,
+        replicas=replicas,
+        capacity=capacity,
+        ahead=len(position) // replicas,
+        engine=by,
+    )
     return with_offsets(position, side, pairs)
 
 
@@ -183,7 +189,7 @@ def test_cells_lose_no_pair_and_say_how_many_they_need(dimension):
             least, largest = (tree_pairs(boxes, side, r) for r in (cutoff, cutoff + 1e-6 * side))
             n = boxes.shape[1]
             flat = jnp.asarray(boxes.reshape(-1, dimension))
-            search = partial(cells, flat, side, cutoff, replicas=2, capacity=n * n)
+            search = partial(pairs_by_cells, flat, side, cutoff, replicas=2, capacity=n * n)
             i, j, count, longest = search(ahead=n)
             found = listed(i, j, count)
             assert len(set(found)) == len(found), (name, side)  # each once
@@ -200,8 +206,8 @@ def test_cells_lose_no_pair_and_say_how_many_they_need(dimension):
 @pytest.mark.slow
 def test_cells_count_pairs_beyond_their_capacity():
     position = jnp.asarray(10 * np.random.default_rng(1).random((300, 3)))
-    *_, count, _ = cells(position, 10.0, 2.0, replicas=1, capacity=4000, ahead=300)
-    i, j, told, _ = cells(position, 10.0, 2.0, replicas=1, capacity=100, ahead=300)
+    *_, count, _ = pairs_by_cells(position, 10.0, 2.0, replicas=1, capacity=4000, ahead=300)
+    i, j, told, _ = pairs_by_cells(position, 10.0, 2.0, replicas=1, capacity=100, ahead=300)
     assert told == count > 100
     assert np.all(np.asarray(i) < np.asarray(j))  # all of them pairs
 
@@ -216,7 +222,7 @@ def test_a_sweep_looks_as_far_as_it_must():
         position = gas * np.array([squeezed, 1.0, 1.0])
         expected = tree_pairs(position, side, 1.0)
         flat = jnp.asarray(position.reshape(-1, 3))
-        look = partial(sweep, flat, side, 1.0, replicas=2, capacity=len(expected) + 9)
+        look = partial(pairs_by_sweep, flat, side, 1.0, replicas=2, capacity=len(expected) + 9)
         i, j, count, ahead = look(ahead=n)
         found = listed(i, j, count)
         assert set(found) == expected and len(found) == len(expected)
@@ -228,7 +234,7 @@ def test_a_sweep_looks_as_far_as_it_must():
         assert told == ahead and enough == count
 
 
-@pytest.mark.parametrize("search", [sweep, cells])
+@pytest.mark.parametrize("search", [pairs_by_sweep, pairs_by_cells])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_no_pair_just_within_the_cutoff_is_missed(dtype, search):
     # Far apart, so that a whole number of steps of the side is many of the cutoff's round-off.
@@ -251,10 +257,12 @@ def test_no_pair_just_within_the_cutoff_is_missed(dtype, search):
     assert tree.query_pairs(cutoff) <= found <= tree.query_pairs(cutoff + 1e-6 * (cutoff + side))
 
 
-@pytest.mark.parametrize("search, possible", [(sweep, 992), (cells, 192)])
-def test_a_search_over_too_many_is_refused(search, possible):
+@pytest.mark.parametrize(
+    "search, name, possible", [(pairs_by_sweep, "sweep", 992), (pairs_by_cells, "cells", 192)]
+)
+def test_a_search_over_too_many_is_refused(search, name, possible):
     position = jax.ShapeDtypeStruct((2**26, 3), jnp.float32)
     look = partial(search, side=1000.0, cutoff=1.0, replicas=1, capacity=9, ahead=2**10)
-    message = f"{search.__name__}.*1024.* allow {possible}"
+    message = f"{name}.*1024.* allow {possible}"
     with pytest.raises(ValueError, match=message):
         jax.eval_shape(look, position)

@@ -29,7 +29,7 @@ from jaxgran.particles.elements import (
 )
 from jaxgran.particles.hard.impacts import MAX_ROUNDS, ImpactWork, execute_impacts
 from jaxgran.particles.hard.prediction import ImpactCandidates, PairRows, Paths, first_impacts
-from jaxgran.particles.neighbours.lists import Pairs, wrap
+from jaxgran.particles.neighbours.pairs import Pairs, wrap
 from jaxgran.particles.neighbours.selection import select_members
 from jaxgran.particles.spheres import (
     FATAL,
@@ -284,12 +284,16 @@ class HardDynamics(AbstractSphereDynamics):
         disturbed = jnp.minimum(jnp.minimum(free.final[i], free.final[j]), duration)
         closer = free.motion.gap(disturbed) < 2 * rows.bound * (duration - disturbed)
         selected = rows.real & (jnp.isfinite(free.times) | closer)
-        at_walls = jnp.zeros(n, bool) if free.wall_times is None else jnp.isfinite(free.wall_times)
-        found = select_members(selected, i, j, at_walls, self.capacity[3:])
+        at_walls = jnp.zeros(n, bool) if free.walls is None else jnp.isfinite(free.walls.times)
+        max_rows = self.capacity.contacts
+        max_members = self.capacity.members
+        found = select_members(selected, i, j, at_walls, max_rows=max_rows, max_members=max_members)
         rows = PairRows(
             found.first, found.second, offset[found.rows], rows.bound[found.rows], found.real
         )
-        needed = jnp.stack([pairs.count, pairs.lookahead, num_near, *found.counts])
+        needed = jnp.stack(
+            [pairs.count, pairs.lookahead, num_near, found.num_rows, found.num_members]
+        )
         return ImpactCandidates(found.members, rows, found.members // size, needed)
 
     def _state_after_window(

@@ -23,12 +23,16 @@ from jaxgran.particles.hard.prediction import (
     ImpactCandidates,
     PairRows,
     Paths,
+    WallImpacts,
     first_impacts,
 )
 from jaxgran.particles.spheres import SphereState, temperature
 from jaxgran.scene.elements import wall_impact_ratio
 from jaxgran.scene.laws import ReducedLaw
 from jaxgran.scene.reduced import ReducedScene, SphereScene
+
+MAX_ROUNDS = 100_000
+"""Rounds of independent impacts in one window at which the run counts as stalled."""
 
 
 class LawOfReplicas(ReducedLaw):
@@ -60,6 +64,7 @@ class ImpactEvents(NamedTuple):
         spin: sum of the (transformed) spins of both spheres; at a wall, the spin of the sphere.
             None for smooth spheres.
         elastic: whether the impact is elastic and smooth.
+        axis: across which the wall lies; None for impacts of two spheres.
     """
 
     time: Float[Array, "rows"]
@@ -68,6 +73,12 @@ class ImpactEvents(NamedTuple):
     speed: Float[Array, "rows"]
     spin: Float[Array, "rows spins"] | None
     elastic: Bool[Array, "rows"]
+    axis: Int[Array, "rows"] | None = None
+
+    @property
+    def share(self) -> float:
+        """Share of the first sphere in the change of velocity: half of two, all at a wall."""
+        return 0.5 if self.axis is None else 1.0
 
 
 class ImpactEffect(NamedTuple):
@@ -89,18 +100,11 @@ class ImpactEffect(NamedTuple):
     rotational_gain: Float[Array, "rows"] | None = None
 
 
-def impact_effect(
-    scene: SphereScene, impact: ImpactEvents, axis: Int[Array, "rows"] | None = None
-) -> ImpactEffect:
-    """Return the effect of impacts of two spheres, or on walls across an axis; see `jaxgran.Rough`.
-
-    Walls that are closer together or dissipate more are hit more often, see `wall_impact_ratio`. A
-    tangent does not know where walls and spheres are, but only how often a gas meets the walls:
-    energies at walls have a factor of value 1 that carries this dependence.
-    """
+def impact_effect(scene: SphereScene, impact: ImpactEvents) -> ImpactEffect:
+    """Return the effect of impacts of two spheres, or on walls; see `jaxgran.Rough`."""
     material = scene.material
-    law = material.law if axis is None else material.walls.law
-    share = 0.5 if axis is None else 1.0  # a wall takes no part of the change of velocity
+    law = material.law if impact.axis is None else material.walls.law
+    share = impact.share
     decay = drag_decay(scene.drag_rates, impact.time)
     law_speed = impact.speed * 0.5**0.5  # the law's unit of speed is sqrt(2)
     eps = law.restitution(law_speed * decay.velocity)
@@ -109,15 +113,10 @@ def impact_effect(
     lost = share**2 / 2 * (1 - eps**2) * impact.speed**2
     effect = ImpactEffect(-push[:, None] * impact.normal, lost)
     if material.surface is not None and impact.spin is not None:
-        effect = _with_tangential_part(effect, material, impact, impact.spin, axis, push, decay)
-    if axis is None:
+        effect = _with_tangential_part(effect, material, impact, impact.spin, push, decay)
+    if impact.axis is None:
         return effect
-    frequency = material.walls.frequency[axis]
-    frequency = frequency * wall_impact_ratio(eps, frequency, impact.normal.shape[1])
-    weight = frequency / jax.lax.stop_gradient(frequency)
-    gain = effect.rotational_gain
-    gain = None if gain is None else gain * weight
-    return effect._replace(lost=effect.lost * weight, rotational_gain=gain)
+    return _with_frequency(effect, material.walls.frequency[impact.axis], eps)
 
 
 def _with_tangential_part(
@@ -125,7 +124,6 @@ def _with_tangential_part(
     material: ReducedScene,
     impact: ImpactEvents,
     spin: Float[Array, "rows spins"],
-    axis: Int[Array, "rows"] | None,
     push: Float[Array, "rows"],
     decay: DragDecay,
 ) -> ImpactEffect:
@@ -138,18 +136,20 @@ def _with_tangential_part(
 
     Args:
         effect: of the normal part.
-        material, impact, axis: see `impact_effect`.
+        material: of the scene.
+        impact: see `impact_effect`.
         spin: of the impact.
         push: normal change of velocity of the first sphere.
         decay: by drag until the impact.
     """
     surface = material.surface
-    spin_change = jnp.zeros_like(spin)
-    gain = spin_change[:, 0]
-    if axis is not None and material.walls.surface is None:
-        return effect._replace(spin_change=spin_change, rotational_gain=gain)
-    share = 0.5 if axis is None else 1.0
-    eta = surface.eta if axis is None else surface.eta_on_wall(material.walls.surface)
+    share = impact.share
+    eta = surface.eta
+    if impact.axis is not None:
+        if material.walls.surface is None:
+            unchanged = jnp.zeros_like(spin)
+            return effect._replace(spin_change=unchanged, rotational_gain=unchanged[:, 0])
+        eta = surface.eta_on_wall(material.walls.surface)
     spin_factor = decay.spin_over_velocity[:, None]
     sideways, kick, added_spin = tangential_impulse(
         impact.relative,
@@ -172,17 +172,39 @@ def _with_tangential_part(
     )
 
 
+def _with_frequency(
+    effect: ImpactEffect, frequency: Float[Array, "rows"], eps: Float[Array, "rows"]
+) -> ImpactEffect:
+    """Return the effect of impacts on walls with the dependence of their frequency in tangents.
+
+    Walls that are closer together or dissipate more are hit more often, see `wall_impact_ratio`. A
+    tangent does not know where walls and spheres are, but only how often a gas meets the walls:
+    energies at walls have a factor of value 1 that carries this dependence.
+    """
+    dimension = effect.kick.shape[1]
+    frequency = frequency * wall_impact_ratio(eps, frequency, dimension)
+    weight = frequency / jax.lax.stop_gradient(frequency)
+    gain = effect.rotational_gain
+    gain = None if gain is None else gain * weight
+    return effect._replace(lost=effect.lost * weight, rotational_gain=gain)
+
+
 def exchange_gains(
     scene: SphereScene,
     tangents: ExchangeTangents,
     impact: ImpactEvents,
     happens: Bool[Array, "rows"],
-    axis: Int[Array, "rows"] | None = None,
 ) -> Float[Array, "changes energies rows"]:
     """Return the tangents of the gain of each energy.
 
     They are along the directions of `tangents`, then in the logarithm of all velocities, and of all
     spins where spheres rotate, as `ExchangeTangents.after` takes them.
+
+    Args:
+        scene: the gas.
+        tangents: which give the directions and the number of energies.
+        impact: the spheres at impacts.
+        happens: whether each impact does; the others gain nothing.
     """
 
     def energies(material: ReducedScene, log_scales: Float[Array, "energies"]) -> Array:
@@ -193,22 +215,74 @@ def exchange_gains(
             inertia = scene.material.surface.inertia
             log_spin = log_scales[1] - 0.5 * jnp.log(material.surface.inertia / inertia)
             scaled = scaled._replace(spin=impact.spin * jnp.exp(log_spin))
-        effect = impact_effect(scene._replace(material=material), scaled, axis)
+        effect = impact_effect(scene._replace(material=material), scaled)
         gained = [-effect.lost]
         if effect.rotational_gain is not None:
             gained.append(effect.rotational_gain)
         return jnp.where(happens, jnp.stack(gained), 0.0)
 
-    num_energies = tangents.energies.shape[1]
-    none = jnp.zeros(num_energies, impact.speed.dtype)
-    _, linear = jax.linearize(energies, scene.material, none)
-    num_directions = len(tangents.energies)
-    scales = jnp.concatenate([jnp.zeros((num_directions, num_energies)), jnp.eye(num_energies)])
+    num_directions, num_energies, *_ = tangents.energies.shape
+    unscaled = jnp.zeros(num_energies, impact.speed.dtype)
+    _, linear = jax.linearize(energies, scene.material, unscaled)
 
     def padded(directions: Array) -> Array:
         return jnp.pad(directions, [(0, num_energies), *[(0, 0)] * (directions.ndim - 1)])
 
-    return jax.vmap(linear)(jax.tree.map(padded, tangents.directions), scales.astype(none.dtype))
+    # First the directions without a scale, then each scale without a direction.
+    directions = jax.tree.map(padded, tangents.directions)
+    scales = jnp.concatenate([jnp.zeros((num_directions, num_energies)), jnp.eye(num_energies)])
+    return jax.vmap(linear)(directions, scales.astype(unscaled.dtype))
+
+
+class IndependentPairs(NamedTuple):
+    """The pairs whose impacts happen in one round.
+
+    Attributes:
+        happens: whether the impact of each row happens.
+        row_of_slot: the row in which a sphere can have its next impact: the first of several at the
+            same time; the number of rows if there is none.
+    """
+
+    happens: Bool[Array, "rows"]
+    row_of_slot: Int[Array, "slots"]
+
+    @property
+    def unpaired(self) -> Bool[Array, "slots"]:
+        """Which spheres no other may hit in this round."""
+        return self.row_of_slot == len(self.happens)
+
+
+def independent_pairs(rows: PairRows, upcoming: FirstImpacts) -> IndependentPairs:
+    """Return the pairs whose impact is the first of both spheres, on paths that are final."""
+    a = rows.a
+    b = rows.b
+    num_rows = len(a)
+    index = jnp.arange(num_rows, dtype=jnp.int32)
+    times = upcoming.times
+    happens = jnp.isfinite(times)
+    for k in (a, b):
+        happens &= (times == upcoming.first[k]) & (times == upcoming.final[k])
+    # Of several impacts at exactly the same time, a sphere takes the one in the first row.
+    rank = jnp.where(happens, index, num_rows)
+    row = jnp.full(len(upcoming.first), num_rows, jnp.int32).at[a].min(rank).at[b].min(rank)
+    happens &= (row[a] == index) & (row[b] == index)
+    return IndependentPairs(happens, row)
+
+
+class RoundImpacts(NamedTuple):
+    """Impacts of pairs or on walls in one round.
+
+    Attributes:
+        happens: whether each of them does.
+        time: since the start of the window; 0 if it does not happen.
+        too_soon: whether it follows the last one too soon.
+        events: the spheres at these impacts.
+    """
+
+    happens: Bool[Array, "rows"]
+    time: Float[Array, "rows"]
+    too_soon: Bool[Array, "rows"]
+    events: ImpactEvents
 
 
 class SlotImpacts(NamedTuple):
@@ -217,106 +291,16 @@ class SlotImpacts(NamedTuple):
     Attributes:
         happens: whether it has one.
         time: its time.
+        too_soon: whether it follows the last one too soon.
         x: position of the path after it, extrapolated back to the start of the window.
         effect: on the particle.
-        too_soon: whether it follows the last one too soon.
     """
 
     happens: Bool[Array, "slots"]
     time: Float[Array, "slots"]
+    too_soon: Bool[Array, "slots"]
     x: Float[Array, "slots d"]
     effect: ImpactEffect
-    too_soon: Bool[Array, "slots"]
-
-
-class ImpactRules(NamedTuple):
-    """What decides the effect of impacts in a window.
-
-    Attributes:
-        scene: the gas, with one law for all rows or one for each.
-        tangents: at the beginning of the window; None without them.
-        start_time: of the window.
-        contact_duration: of each particle; an impact within this time of the last one is elastic.
-        all_elastic: whether all impacts are elastic and smooth.
-        rows: the pairs that may touch.
-    """
-
-    scene: SphereScene
-    tangents: ExchangeTangents | None
-    start_time: Float[Array, ""]
-    contact_duration: Float[Array, "slots"]
-    all_elastic: Bool[Array, ""]
-    rows: PairRows
-
-    def pair_impacts(
-        self, paths: Paths, upcoming: FirstImpacts
-    ) -> tuple[SlotImpacts, Bool[Array, "slots"], Array | None]:
-        """Return the impacts of pairs, which particles no pair may hit, and gains of the pairs."""
-        a = self.rows.a
-        b = self.rows.b
-        num_rows = len(a)
-        index = jnp.arange(num_rows, dtype=jnp.int32)
-        slots = jnp.arange(len(paths.x), dtype=jnp.int32)
-        times = upcoming.times
-        executable = jnp.isfinite(times)
-        for k in (a, b):
-            executable &= (times == upcoming.first[k]) & (times == upcoming.final[k])
-        # Of several impacts at exactly the same time, a sphere takes the one in the first row.
-        rank = jnp.where(executable, index, num_rows)
-        row = jnp.full(len(slots), num_rows, jnp.int32).at[a].min(rank).at[b].min(rank)
-        executable &= (row[a] == index) & (row[b] == index)
-
-        s = jnp.where(executable, times, 0.0)
-        r = upcoming.r + upcoming.w * s[:, None]
-        normal = r / jnp.where(executable, jnp.sqrt(jnp.sum(r * r, -1)), 1.0)[:, None]
-        speed = jnp.where(executable, -jnp.sum(upcoming.w * normal, -1), 1.0)
-        too_soon = s - jnp.maximum(paths.last[a], paths.last[b]) < self.contact_duration[a]
-        spin = None if paths.spin is None else paths.spin[a] + paths.spin[b]
-        elastic = too_soon | self.all_elastic | ~executable
-        events = ImpactEvents(self.start_time + s, -normal, upcoming.w, speed, spin, elastic)
-        effect = impact_effect(self.scene, events)
-        gains = None
-        if self.tangents is not None:  # each of two loses half of the energy
-            gains = 2 * exchange_gains(self.scene, self.tangents, events, executable)
-
-        # From the rows of pairs to the slots of their spheres.
-        row_or_last = jnp.minimum(row, num_rows - 1)
-        is_first = a[row_or_last] == slots
-        happens = executable[row_or_last] & (is_first | (b[row_or_last] == slots))
-        sign = jnp.where(happens, jnp.where(is_first, 1.0, -1.0), 0.0)
-        effect = jax.tree.map(lambda x: x[row_or_last], effect)
-        effect = effect._replace(kick=sign[:, None] * effect.kick)
-        time = jnp.where(happens, s[row_or_last], 0.0)
-        x = paths.x - effect.kick * time[:, None]
-        impacts = SlotImpacts(happens, time, x, effect, too_soon[row_or_last])
-        return impacts, row == num_rows, gains
-
-    def wall_impacts(
-        self, paths: Paths, upcoming: FirstImpacts, unpaired: Bool[Array, "slots"]
-    ) -> tuple[SlotImpacts, Array | None]:
-        """Return the impacts on walls of particles that no pair may hit, and their gains."""
-        times = upcoming.wall_times
-        axis = upcoming.wall_axis
-        assert times is not None and axis is not None
-        happens = unpaired & jnp.isfinite(times)
-        happens &= (times == upcoming.first) & (times == upcoming.final)
-        s = jnp.where(happens, times, 0.0)
-        too_soon = s - paths.last < self.contact_duration
-        is_axis = axis[:, None] == jnp.arange(paths.v.shape[1])[None]
-        outwards = jnp.where(is_axis, jnp.sign(paths.v), 0.0)
-        speed = jnp.where(happens, jnp.sum(paths.v * outwards, axis=1), 1.0)
-        elastic = too_soon | self.all_elastic | ~happens
-        events = ImpactEvents(self.start_time + s, outwards, paths.v, speed, paths.spin, elastic)
-        effect = impact_effect(self.scene, events, axis)
-        gains = None
-        if self.tangents is not None:
-            gains = exchange_gains(self.scene, self.tangents, events, happens, axis)
-        x = paths.x + paths.v * s[:, None] - (paths.v + effect.kick) * s[:, None]
-        return SlotImpacts(happens, s, x, effect, too_soon), gains
-
-
-MAX_ROUNDS = 100_000
-"""Rounds of independent impacts in one window at which the run counts as stalled."""
 
 
 class ImpactWork(NamedTuple):
@@ -328,7 +312,8 @@ class ImpactWork(NamedTuple):
         rotational_gain: gain of the energy of the (transformed) spins; None for smooth spheres.
         impacts: number of impacts of each particle on others.
         wall_impacts: number of impacts on walls of each particle; None without walls.
-        regularised: number of impacts that were elastic because they followed too soon.
+        regularised: number of impacts that were elastic because they followed too soon; an impact
+            of two spheres counts for both of them, an impact on a wall twice.
         max_distance2: largest squared distance of each particle, at its impacts, from the place for
             which the neighbour list was built.
         max_speed2: largest squared speed of each particle.
@@ -349,6 +334,182 @@ class ImpactWork(NamedTuple):
     executed: Bool[Array, ""]
     num_rounds: Int[Array, ""]
     gains: Float[Array, "changes energies rows"]
+
+
+class ImpactWindow(NamedTuple):
+    """A window of time, and what decides the impacts in it.
+
+    Attributes:
+        scene: the gas, with one law for all rows or one for each.
+        rows: the pairs that may touch.
+        listed: the places of the particles for which the neighbour list was built.
+        start_time: of the window.
+        duration: of the window.
+        contact_duration: of each particle; an impact within this time of the last one is elastic.
+        all_elastic: whether all impacts are elastic and smooth.
+        tangents: at the beginning of the window; None without them.
+    """
+
+    scene: SphereScene
+    rows: PairRows
+    listed: Float[Array, "slots d"]
+    start_time: Float[Array, ""]
+    duration: ArrayLike
+    contact_duration: Float[Array, "slots"]
+    all_elastic: Bool[Array, ""]
+    tangents: ExchangeTangents | None
+
+    def no_work(self, paths: Paths) -> ImpactWork:
+        """Return the particles before the first impact."""
+        num_slots = len(paths.x)
+        num_rows = len(self.rows.a)
+        has_walls = self.scene.container is not None
+        counts = jnp.zeros(num_slots, jnp.int32)
+        zeros = jnp.zeros(num_slots, paths.x.dtype)
+        shape = (0, 1, num_rows)
+        if self.tangents is not None:
+            num_directions, num_energies, _ = self.tangents.energies.shape
+            num_wall_rows = num_slots if has_walls else 0
+            shape = (num_directions + num_energies, num_energies, num_rows + num_wall_rows)
+        return ImpactWork(
+            paths=paths,
+            dissipated=zeros,
+            rotational_gain=None if paths.spin is None else zeros,
+            impacts=counts,
+            wall_impacts=counts if has_walls else None,
+            regularised=counts,
+            max_distance2=zeros,
+            max_speed2=zeros,
+            executed=jnp.array(True),
+            num_rounds=jnp.int32(0),
+            gains=jnp.zeros(shape, zeros.dtype),
+        )
+
+    def execute_round(self, work: ImpactWork) -> ImpactWork:
+        """Execute every impact that is the first of its spheres, on paths that are final."""
+        paths = work.paths
+        upcoming = first_impacts(paths, self.rows, self.duration, self.scene.container)
+        pairs = independent_pairs(self.rows, upcoming)
+        of_pairs = self.pair_impacts(paths, upcoming, pairs)
+        slots = self.slots_of_pairs(paths, pairs, of_pairs)
+        impacts = work.impacts + slots.happens.astype(jnp.int32)
+        regularised = work.regularised + (slots.happens & slots.too_soon).astype(jnp.int32)
+        wall_impacts = work.wall_impacts
+        at_walls = None
+        if upcoming.walls is not None and wall_impacts is not None:
+            at_walls = self.wall_impacts(paths, upcoming, upcoming.walls, pairs.unpaired)
+            hits_wall = at_walls.happens
+            slots_at_walls = self.slots_at_walls(paths, at_walls)
+            slots = jax.tree.map(partial(_where_rows, hits_wall), slots_at_walls, slots)
+            wall_impacts = wall_impacts + hits_wall.astype(jnp.int32)
+            regularised = regularised + 2 * (hits_wall & at_walls.too_soon).astype(jnp.int32)
+        gains = work.gains
+        if self.tangents is not None:
+            gains = gains + self.energy_gains(self.tangents, of_pairs, at_walls)
+
+        happens = slots.happens
+        s = slots.time
+        effect = slots.effect
+        v = paths.v + effect.kick
+        distance2 = jnp.sum((paths.x + paths.v * s[:, None] - self.listed) ** 2, -1)
+        return ImpactWork(
+            paths=Paths(
+                x=slots.x,
+                v=v,
+                last=jnp.where(happens, s, paths.last),
+                spin=_added(paths.spin, happens, effect.spin_change),
+            ),
+            dissipated=work.dissipated + jnp.where(happens, effect.lost, 0.0),
+            rotational_gain=_added(work.rotational_gain, happens, effect.rotational_gain),
+            impacts=impacts,
+            wall_impacts=wall_impacts,
+            regularised=regularised,
+            max_distance2=jnp.maximum(work.max_distance2, jnp.where(happens, distance2, 0.0)),
+            max_speed2=jnp.maximum(work.max_speed2, jnp.sum(v * v, -1)),
+            executed=jnp.any(happens),
+            num_rounds=work.num_rounds + 1,
+            gains=gains,
+        )
+
+    def pair_impacts(
+        self, paths: Paths, upcoming: FirstImpacts, pairs: IndependentPairs
+    ) -> RoundImpacts:
+        """Return the impacts of the rows of pairs."""
+        a = self.rows.a
+        b = self.rows.b
+        happens = pairs.happens
+        s = jnp.where(happens, upcoming.times, 0.0)
+        r = upcoming.r + upcoming.w * s[:, None]
+        normal = r / jnp.where(happens, jnp.sqrt(jnp.sum(r * r, -1)), 1.0)[:, None]
+        too_soon = s - jnp.maximum(paths.last[a], paths.last[b]) < self.contact_duration[a]
+        events = ImpactEvents(
+            time=self.start_time + s,
+            normal=-normal,
+            relative=upcoming.w,
+            speed=jnp.where(happens, -jnp.sum(upcoming.w * normal, -1), 1.0),
+            spin=None if paths.spin is None else paths.spin[a] + paths.spin[b],
+            elastic=too_soon | self.all_elastic | ~happens,
+        )
+        return RoundImpacts(happens, s, too_soon, events)
+
+    def slots_of_pairs(
+        self, paths: Paths, pairs: IndependentPairs, impacts: RoundImpacts
+    ) -> SlotImpacts:
+        """Return the impacts of pairs by the slots of their spheres."""
+        slots = jnp.arange(len(paths.x), dtype=jnp.int32)
+        row = jnp.minimum(pairs.row_of_slot, len(self.rows.a) - 1)
+        is_first = self.rows.a[row] == slots
+        happens = impacts.happens[row] & (is_first | (self.rows.b[row] == slots))
+        sign = jnp.where(happens, jnp.where(is_first, 1.0, -1.0), 0.0)
+        effect = jax.tree.map(lambda x: x[row], impact_effect(self.scene, impacts.events))
+        effect = effect._replace(kick=sign[:, None] * effect.kick)
+        time = jnp.where(happens, impacts.time[row], 0.0)
+        x = paths.x - effect.kick * time[:, None]
+        return SlotImpacts(happens, time, impacts.too_soon[row], x, effect)
+
+    def wall_impacts(
+        self,
+        paths: Paths,
+        upcoming: FirstImpacts,
+        walls: WallImpacts,
+        unpaired: Bool[Array, "slots"],
+    ) -> RoundImpacts:
+        """Return the impacts on walls of particles that no other may hit."""
+        times = walls.times
+        happens = unpaired & jnp.isfinite(times)
+        happens &= (times == upcoming.first) & (times == upcoming.final)
+        s = jnp.where(happens, times, 0.0)
+        too_soon = s - paths.last < self.contact_duration
+        is_axis = walls.axis[:, None] == jnp.arange(paths.v.shape[1])[None]
+        outwards = jnp.where(is_axis, jnp.sign(paths.v), 0.0)
+        events = ImpactEvents(
+            time=self.start_time + s,
+            normal=outwards,
+            relative=paths.v,
+            speed=jnp.where(happens, jnp.sum(paths.v * outwards, axis=1), 1.0),
+            spin=paths.spin,
+            elastic=too_soon | self.all_elastic | ~happens,
+            axis=walls.axis,
+        )
+        return RoundImpacts(happens, s, too_soon, events)
+
+    def slots_at_walls(self, paths: Paths, impacts: RoundImpacts) -> SlotImpacts:
+        """Return the impacts on walls by the slots of the spheres, which are their rows."""
+        effect = impact_effect(self.scene, impacts.events)
+        s = impacts.time[:, None]
+        x = paths.x + paths.v * s - (paths.v + effect.kick) * s
+        return SlotImpacts(impacts.happens, impacts.time, impacts.too_soon, x, effect)
+
+    def energy_gains(
+        self, tangents: ExchangeTangents, of_pairs: RoundImpacts, at_walls: RoundImpacts | None
+    ) -> Float[Array, "changes energies rows"]:
+        """Return `ImpactWork.gains` of a round."""
+        # Each of two spheres gains half of the energy.
+        gains = 2 * exchange_gains(self.scene, tangents, of_pairs.events, of_pairs.happens)
+        if at_walls is None:
+            return gains
+        wall_gains = exchange_gains(self.scene, tangents, at_walls.events, at_walls.happens)
+        return jnp.concatenate([gains, wall_gains], axis=-1)
 
 
 def execute_impacts(
@@ -377,94 +538,60 @@ def execute_impacts(
         all_elastic: whether all impacts are elastic and smooth.
     """
 
-    def of_members(values):
+    def of_members(values: Float[Array, "n ..."]) -> Float[Array, "slots ..."]:
         return values.at[candidates.members].get(mode="fill", fill_value=0.0)
 
     internal = state.internal
-    tangents = state.tangents
-    start_time = state.time + state.time_rest
-    spin = None if internal.spin is None else of_members(internal.spin)
-    x, v, listed = (of_members(values) for values in (state.position, state.velocity, listed))
-    paths = Paths(x, v, -of_members(internal.age), spin)
+    paths = Paths(
+        x=of_members(state.position),
+        v=of_members(state.velocity),
+        last=-of_members(internal.age),
+        spin=None if internal.spin is None else of_members(internal.spin),
+    )
+    window = ImpactWindow(
+        scene=_with_law_of_rows(scene, candidates),
+        rows=candidates.rows,
+        listed=of_members(listed),
+        start_time=state.time + state.time_rest,
+        duration=duration,
+        contact_duration=_contact_durations(state, candidates, scene, contact_time),
+        all_elastic=all_elastic,
+        tangents=state.tangents,
+    )
+
+    def unfinished(work: ImpactWork) -> Bool[Array, ""]:
+        return work.executed & (work.num_rounds < MAX_ROUNDS)
+
+    return jax.lax.while_loop(unfinished, window.execute_round, window.no_work(paths))
+
+
+def _with_law_of_rows(scene: SphereScene, candidates: ImpactCandidates) -> SphereScene:
+    """Return the scene with a law for each row of pairs, if replicas have different laws."""
+    law = scene.material.law
+    if not isinstance(law, LawOfReplicas):
+        return scene
+    law = law.of_rows(candidates.replica[candidates.rows.a])
+    return scene._replace(material=scene.material._replace(law=law))
+
+
+def _contact_durations(
+    state: SphereState,
+    candidates: ImpactCandidates,
+    scene: SphereScene,
+    contact_time: Float[Array, ""],
+) -> Float[Array, "slots"]:
+    """Return the contact time of each member in the units of the run."""
     replicas = len(state.dissipated)
     T = temperature(state.velocity, replicas)
     T = jnp.maximum(T, jnp.finfo(T.dtype).tiny)
-    contact_duration = contact_time / (scene.collision_frequency * jnp.sqrt(T))
-    contact_duration = contact_duration[jnp.minimum(candidates.replica, replicas - 1)]
-    rows = candidates.rows
-    law = scene.material.law
-    if isinstance(law, LawOfReplicas):
-        law = law.of_rows(candidates.replica[rows.a])
-        scene = scene._replace(material=scene.material._replace(law=law))
-    rules = ImpactRules(scene, tangents, start_time, contact_duration, all_elastic, rows)
-
-    def one_round(work: ImpactWork) -> ImpactWork:
-        paths = work.paths
-        upcoming = first_impacts(paths, rows, duration, scene.container)
-        of_pairs, unpaired, gains = rules.pair_impacts(paths, upcoming)
-        happening = of_pairs
-        wall_impacts = work.wall_impacts
-        regularised = work.regularised + (of_pairs.happens & of_pairs.too_soon).astype(jnp.int32)
-        if wall_impacts is not None:
-            at_walls, wall_gains = rules.wall_impacts(paths, upcoming, unpaired)
-            happening = jax.tree.map(partial(_where_rows, at_walls.happens), at_walls, of_pairs)
-            wall_impacts = wall_impacts + at_walls.happens.astype(jnp.int32)
-            # An impact of two spheres counts twice.
-            too_soon = at_walls.happens & at_walls.too_soon
-            regularised = regularised + 2 * too_soon.astype(jnp.int32)
-            if gains is not None and wall_gains is not None:
-                gains = jnp.concatenate([gains, wall_gains], axis=-1)
-        hit = happening.happens
-        s = happening.time
-        effect = happening.effect
-        v = paths.v + effect.kick
-        spin = paths.spin
-        rotational_gain = work.rotational_gain
-        if spin is not None and rotational_gain is not None and effect.rotational_gain is not None:
-            spin = spin + _where_rows(hit, effect.spin_change, jnp.zeros_like(spin))
-            rotational_gain = rotational_gain + jnp.where(hit, effect.rotational_gain, 0.0)
-        distance2 = jnp.sum((paths.x + paths.v * s[:, None] - listed) ** 2, -1)
-        return ImpactWork(
-            paths=Paths(happening.x, v, jnp.where(hit, s, paths.last), spin),
-            dissipated=work.dissipated + jnp.where(hit, effect.lost, 0.0),
-            rotational_gain=rotational_gain,
-            impacts=work.impacts + of_pairs.happens.astype(jnp.int32),
-            wall_impacts=wall_impacts,
-            regularised=regularised,
-            max_distance2=jnp.maximum(work.max_distance2, jnp.where(hit, distance2, 0.0)),
-            max_speed2=jnp.maximum(work.max_speed2, jnp.sum(v * v, -1)),
-            executed=jnp.any(hit),
-            num_rounds=work.num_rounds + 1,
-            gains=work.gains if gains is None else work.gains + gains,
-        )
-
-    def unfinished(work: ImpactWork):
-        return work.executed & (work.num_rounds < MAX_ROUNDS)
-
-    num_slots = len(x)
-    num_rows = len(rows.a)
-    counts = jnp.zeros(num_slots, jnp.int32)
-    zeros = jnp.zeros(num_slots, paths.x.dtype)
-    shape = 0, 1, num_rows
-    if tangents is not None:
-        num_directions, num_energies, _ = tangents.energies.shape
-        num_wall_rows = 0 if scene.container is None else num_slots
-        shape = num_directions + num_energies, num_energies, num_rows + num_wall_rows
-    work = ImpactWork(
-        paths=paths,
-        dissipated=zeros,
-        rotational_gain=None if paths.spin is None else zeros,
-        impacts=counts,
-        wall_impacts=None if scene.container is None else counts,
-        regularised=counts,
-        max_distance2=zeros,
-        max_speed2=zeros,
-        executed=jnp.array(True),
-        num_rounds=jnp.int32(0),
-        gains=jnp.zeros(shape, zeros.dtype),
-    )
-    return jax.lax.while_loop(unfinished, one_round, work)
+    duration = contact_time / (scene.collision_frequency * jnp.sqrt(T))
+    return duration[jnp.minimum(candidates.replica, replicas - 1)]
 
 
-def _where_rows(mask: Bool[Array, "rows"], x: Any, y: Any) -> Array:
+def _added(total: Any, happens: Bool[Array, "rows"], change: Any) -> Any:
+    """Return a sum with the changes of impacts; None, a sum that is not kept, remains None."""
+    return None if total is None else total + _where_rows(happens, change, jnp.zeros_like(total))
+
+
+def _where_rows(mask: Bool[Array, "rows"], x: Array, y: Array) -> Array:
     return jnp.where(mask if x.ndim == 1 else mask[:, None], x, y)

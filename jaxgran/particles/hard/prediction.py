@@ -18,7 +18,7 @@ class PairRows(NamedTuple):
 
     Attributes:
         a, b: the slots of the two particles.
-        offset: of the pair, as in `Pairs`.
+        offset: of the pair, as in `jaxgran.particles.neighbours.pairs.Pairs`.
         bound: an upper bound on the speed of all spheres of this replica during the window.
         real: whether the row holds a pair.
     """
@@ -75,10 +75,20 @@ class RelativeMotion(NamedTuple):
         return jnp.where(touch, since + ahead, jnp.inf)
 
 
-def next_wall_impacts(
-    container: Float[Array, "d"], paths: Paths, end: ArrayLike
-) -> tuple[Float[Array, "slots"], Int[Array, "slots"]]:
-    """Return the times of the next impacts on walls, inf if there is none, and their axes."""
+class WallImpacts(NamedTuple):
+    """Next impacts of particles on walls.
+
+    Attributes:
+        times: of each particle's impact; inf if there is none before the end.
+        axis: across which the wall lies.
+    """
+
+    times: Float[Array, "slots"]
+    axis: Int[Array, "slots"]
+
+
+def next_wall_impacts(container: Float[Array, "d"], paths: Paths, end: ArrayLike) -> WallImpacts:
+    """Return the next impacts on walls before `end`."""
     x = paths.x
     v = paths.v
     target = jnp.where(v > 0, container[None] - 0.5, 0.5)
@@ -87,7 +97,7 @@ def next_wall_impacts(
     axis = jnp.argmin(times_by_axis, axis=1)
     # A sphere that rounding has left beyond a wall hits it at once.
     times = jnp.maximum(jnp.min(times_by_axis, axis=1), jnp.maximum(paths.last, 0.0))
-    return jnp.where(times < end, times, jnp.inf), axis
+    return WallImpacts(jnp.where(times < end, times, jnp.inf), axis)
 
 
 class FirstImpacts(NamedTuple):
@@ -98,7 +108,7 @@ class FirstImpacts(NamedTuple):
             of each pair.
         motion: the same vectors as scalar products.
         times: of each pair's impact; inf if there is none before the end.
-        wall_times, wall_axis: of each particle's impact on a wall; None without walls.
+        walls: next impacts on walls; None without walls.
         first: the earliest impact time of each particle on its current path.
         final: a lower bound on the time until which each particle's path is final.
     """
@@ -107,8 +117,7 @@ class FirstImpacts(NamedTuple):
     w: Float[Array, "rows d"]
     motion: RelativeMotion
     times: Float[Array, "rows"]
-    wall_times: Float[Array, "slots"] | None
-    wall_axis: Int[Array, "slots"] | None
+    walls: WallImpacts | None
     first: Float[Array, "slots"]
     final: Float[Array, "slots"]
 
@@ -122,23 +131,45 @@ def first_impacts(
     r = paths.x[a] - paths.x[b] - rows.offset
     w = paths.v[a] - paths.v[b]
     motion = RelativeMotion(jnp.sum(r * r, -1), jnp.sum(r * w, -1), jnp.sum(w * w, -1))
-    last = paths.last[a], paths.last[b]
-    times = motion.impact_time(jnp.maximum(jnp.maximum(*last), 0.0))
+    last_of_a = paths.last[a]
+    last_of_b = paths.last[b]
+    times = motion.impact_time(jnp.maximum(jnp.maximum(last_of_a, last_of_b), 0.0))
     times = jnp.where(rows.real & (times < end), times, jnp.inf)
     first = jnp.full(len(paths.x), jnp.inf, times.dtype).at[a].min(times).at[b].min(times)
-    wall_times = wall_axis = None
+    walls = None
     if container is not None:
-        wall_times, wall_axis = next_wall_impacts(container, paths, end)
-        first = jnp.minimum(first, wall_times)
-
-    # The path of a particle changes at its first impact, or when it is hit by a particle whose path
-    # has changed earlier. Such a particle moves no faster than the bound on all speeds, which gives
-    # the earliest time at which it can arrive. These times depend on each other from pair to pair;
-    # starting from `first` they are lowered until they are consistent.
+        walls = next_wall_impacts(container, paths, end)
+        first = jnp.minimum(first, walls.times)
     speed = jnp.sqrt(jnp.sum(paths.v**2, -1))
-    closing = rows.bound + speed[a], rows.bound + speed[b]
+    final = _final_until(rows, motion, last_of_a, last_of_b, speed, first, end)
+    return FirstImpacts(r, w, motion, times, walls, first, final)
 
-    def arrival(disturbed, last, closing):
+
+def _final_until(
+    rows: PairRows,
+    motion: RelativeMotion,
+    last_of_a: Float[Array, "rows"],
+    last_of_b: Float[Array, "rows"],
+    speed: Float[Array, "slots"],
+    first: Float[Array, "slots"],
+    end: ArrayLike,
+) -> Float[Array, "slots"]:
+    """Return a lower bound on the time until which the path of each particle is final.
+
+    The path of a particle changes at its first impact, or when it is hit by a particle whose path
+    has changed earlier. Such a particle moves no faster than the bound on all speeds, which gives
+    the earliest time at which it can arrive. These times depend on each other from pair to pair;
+    starting from the first impacts they are lowered until they are consistent.
+    """
+    a = rows.a
+    b = rows.b
+    closing_on_a = rows.bound + speed[a]
+    closing_on_b = rows.bound + speed[b]
+
+    def arrival(
+        disturbed: Float[Array, "rows"], last: Float[Array, "rows"], closing: Float[Array, "rows"]
+    ) -> Float[Array, "rows"]:
+        """Return when the other particle of a pair, disturbed at some time, can arrive."""
         arrives = rows.real & (disturbed < end)
         disturbed = jnp.where(arrives, disturbed, 0.0)
         # The path of the particle that may be hit is known from its last impact on only.
@@ -146,14 +177,18 @@ def first_impacts(
         gap_left = motion.gap(since) - 2 * rows.bound * (since - disturbed)
         return jnp.where(arrives, since + jnp.maximum(gap_left, 0.0) / closing, jnp.inf)
 
-    def lower(carry):
+    def lower(carry: tuple) -> tuple:
         final, _ = carry
-        new = final.at[b].min(arrival(final[a], last[1], closing[1]))
-        new = new.at[a].min(arrival(new[b], last[0], closing[0]))
+        new = final.at[b].min(arrival(final[a], last_of_b, closing_on_b))
+        new = new.at[a].min(arrival(new[b], last_of_a, closing_on_a))
         return new, jnp.any(new < jnp.minimum(final, end))  # times after `end` do not matter
 
-    final, _ = jax.lax.while_loop(lambda carry: carry[1], lower, (first, jnp.array(True)))
-    return FirstImpacts(r, w, motion, times, wall_times, wall_axis, first, final)
+    def unfinished(carry: tuple) -> Bool[Array, ""]:
+        _, was_lowered = carry
+        return was_lowered
+
+    final, _ = jax.lax.while_loop(unfinished, lower, (first, jnp.array(True)))
+    return final
 
 
 class ImpactCandidates(NamedTuple):

@@ -19,10 +19,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, UInt32
 
 from jaxgran.particles.bit_masks import WORD, packed, pairs_where, take
-
-STEPS = 2.0**32
-"""Number of steps of a whole number per side of a box. Differences of such numbers are periodic by
-integer overflow."""
+from jaxgran.particles.neighbours.comparisons import (
+    STEPS,
+    num_words_ahead,
+    reach_in_steps,
+    squared_reach,
+)
+from jaxgran.particles.neighbours.pairs import ListedPairs
 
 MIN_PER_CELL = 3
 """Smallest mean number of particles in a cell, before a row is divided finer. Smaller cells would
@@ -42,9 +45,6 @@ MAX_AROUND = 2000
 EDGE_MARGIN = 1e-3
 """Relative margin of the edge of a cell over the cutoff."""
 
-ALTERNATIVES = {"sweep": "'cells' or 'jax-md'", "cells": "'jax-md'"}
-"""Methods that remain where one cannot be used, for messages."""
-
 
 class CellGrid(NamedTuple):
     """Division of a box into cells.
@@ -63,6 +63,22 @@ class CellGrid(NamedTuple):
     occupied: Int[Array, "d"]
 
 
+class SortedParticles(NamedTuple):
+    """Particles of all boxes, sorted by cell.
+
+    Attributes:
+        index: their indices.
+        cell: index of the cell of each, of the cells of all boxes.
+        row: row of the cell.
+        place: place of the cell in its row.
+    """
+
+    index: Int[Array, "n"]
+    cell: Int[Array, "n"]
+    row: Int[Array, "n"]
+    place: Int[Array, "n"]
+
+
 class Rows(NamedTuple):
     """Rows of cells.
 
@@ -77,36 +93,16 @@ class Rows(NamedTuple):
     shift: Int[Array, "rows"]
 
 
-def reach_in_steps(
-    cutoff: ArrayLike, side: ArrayLike, position: Float[Array, "..."]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the cutoff in `STEPS`, enlarged by rounding errors, and its square in float32."""
-    reach_steps = jnp.asarray(cutoff / side) * STEPS
-    reach_steps = reach_steps + 8 + 4 * STEPS * jnp.finfo(position.dtype).eps
-    return reach_steps, (reach_steps * reach_steps * (1 + 1e-6)).astype(jnp.float32)
+class SlotRun(NamedTuple):
+    """Successive slots with which each sorted particle is compared.
 
-
-def num_words_ahead(engine: str, ahead: int, num_particles: int, num_runs: int) -> int:
-    """Return the number of words that hold the comparisons of a run.
-
-    Args:
-        engine: name of the method, for the message.
-        ahead: number of particles with which a particle is compared in a run.
-        num_particles: number of particles of all replicas.
-        num_runs: number of runs of each particle.
-
-    Raises:
-        ValueError: if the words of all particles are too many for 32-bit indices.
+    Attributes:
+        first: first slot.
+        count: number of slots.
     """
-    num_words = max(-(-ahead // WORD), 1)
-    total_runs = num_runs * num_particles
-    if num_words * total_runs >= 2**31:
-        raise ValueError(
-            f"neighbours={engine!r} over {num_particles} particles cannot look {ahead} particles "
-            f"ahead: its indices have 32 bits, which allow {(2**31 - 1) // total_runs * WORD} "
-            f"ahead. Use neighbours={ALTERNATIVES[engine]}"
-        )
-    return num_words
+
+    first: Int[Array, "n"]
+    count: Int[Array, "n"]
 
 
 def expected_run(num_particles: int, cutoff: float, dimension: int) -> float:
@@ -126,7 +122,7 @@ def expected_run(num_particles: int, cutoff: float, dimension: int) -> float:
 
 
 @partial(jax.jit, static_argnames=("replicas", "capacity", "ahead"))
-def cells(
+def pairs_by_cells(
     position: Float[Array, "particles d"],
     side: ArrayLike,
     cutoff: ArrayLike,
@@ -134,12 +130,11 @@ def cells(
     replicas: int,
     capacity: int,
     ahead: int,
-) -> tuple[Int[Array, "{capacity}"], Int[Array, "{capacity}"], Int[Array, ""], Int[Array, ""]]:
+) -> ListedPairs:
     """Find all pairs closer than a cutoff, in each of several equal periodic boxes.
 
-    The work grows as N. Coordinates are rounded to whole numbers of `STEPS`. One bit per comparison
-    says whether the pair is within the cutoff. A box of fewer than three cells a side is one cell,
-    in which every particle is compared with all following ones.
+    The work grows as N. Coordinates are rounded to whole numbers of `STEPS`. A box of fewer than
+    three cells a side is one cell, in which every particle is compared with all following ones.
 
     Args:
         position: positions of all particles, replica after replica, in [0, side).
@@ -162,29 +157,29 @@ def cells(
     n = total // replicas
     num_runs = (3 ** (dimension - 1) + 1) // 2
     num_words = num_words_ahead("cells", min(ahead, n), total, num_runs)
-    reach_steps, square = reach_in_steps(cutoff, side, position)
+    reach = reach_in_steps(cutoff, side, position.dtype)
     finite = jnp.all(jnp.isfinite(position))
     unit, lowest, extent = _along_axes(jnp.where(finite, position / side, 0.0))
     max_cells = max(n // MIN_PER_CELL, 1)
-    grid = _cell_grid(extent, reach_steps / STEPS, max_cells)
-    cell, order = _sort_by_cell(_cells_of_particles(unit, lowest, grid, replicas))
-    rows = _rows(cell, grid, max_cells, replicas, dimension)
-    row = jax.lax.div(cell, grid.occupied[-1])
-    place_in_row = cell - row * grid.occupied[-1]
-    slot, particle = _slots(grid, rows, row, place_in_row, order)
-    firsts, counts = _runs(grid, rows, row, place_in_row, slot)
-    longest = jnp.where(finite, jnp.max(jnp.stack(counts)), 0)
+    grid = _cell_grid(extent, reach / STEPS, max_cells)
+    particles = _sort_by_cell(_cells_of_particles(unit, lowest, grid, replicas), grid)
+    rows = _rows(particles.cell, grid, max_cells, replicas, dimension)
+    slot, particle = _slots(grid, rows, particles)
+    runs = _runs(grid, rows, particles, slot)
+    longest = jnp.where(finite, jnp.max(jnp.stack([run.count for run in runs])), 0)
     steps = [((x - 0.5) * STEPS).astype(jnp.int32) for x in unit]
-    here = [take(x, order) for x in steps]
+    here = [take(x, particles.index) for x in steps]
     there = [take(x, particle) for x in steps]
+    square = squared_reach(reach)
 
     def compare_block(carry: tuple) -> tuple:
         block, words = carry
-        word = [
-            _near_in_window(here, there, first + WORD * block, count - WORD * block, square)
-            for first, count in zip(firsts, counts, strict=True)
+        begin = WORD * block
+        near = [
+            _near_in_window(here, there, SlotRun(run.first + begin, run.count - begin), square)
+            for run in runs
         ]
-        return block + 1, words.at[block].set(jnp.stack(word))
+        return block + 1, words.at[block].set(jnp.stack(near))
 
     def unfinished(carry: tuple) -> Array:
         block, _ = carry
@@ -192,16 +187,17 @@ def cells(
 
     words = jnp.zeros((num_words, num_runs, total), jnp.uint32)
     _, words = jax.lax.while_loop(unfinished, compare_block, (jnp.zeros((), jnp.int32), words))
-    first = jnp.concatenate(firsts)
+    first = jnp.concatenate([run.first for run in runs])
 
     def pair_of(word: Int[Array, "rows"], bit: Int[Array, "rows"]) -> tuple[Array, Array]:
         block = jax.lax.div(word, jnp.int32(num_runs * total))
-        run = word - block * jnp.int32(num_runs * total)
-        other = take(first, run) + WORD * block + bit
-        return take(order, jax.lax.rem(run, jnp.int32(total))), take(particle, other)
+        place = word - block * jnp.int32(num_runs * total)
+        other = take(first, place) + WORD * block + bit
+        compared = jax.lax.rem(place, jnp.int32(total))
+        return take(particles.index, compared), take(particle, other)
 
     i, j, count = pairs_where(words.ravel(), capacity, pair_of)
-    return i, j, count, longest
+    return ListedPairs(i, j, count, lookahead=longest)
 
 
 def _along_axes(
@@ -257,16 +253,24 @@ def _cells_of_particles(
     return cell
 
 
-def _sort_by_cell(cell: Int[Array, "n"]) -> tuple[Int[Array, "n"], Int[Array, "n"]]:
-    """Return the cells of the particles in increasing order, and their particles."""
-    n = len(cell)
+def _sort_by_cell(cell: Int[Array, "n"], grid: CellGrid) -> SortedParticles:
+    """Return the particles in the order of their cells."""
+    cell, index = _sorted_with_index(cell)
+    along_row = grid.occupied[-1]
+    row = jax.lax.div(cell, along_row)
+    return SortedParticles(index, cell, row, place=cell - row * along_row)
+
+
+def _sorted_with_index(values: Int[Array, "n"]) -> tuple[Int[Array, "n"], Int[Array, "n"]]:
+    """Return values >= 0 in increasing order, and where each of them was."""
+    n = len(values)
     index = jnp.arange(n, dtype=jnp.int32)
     if jax.dtypes.canonicalize_dtype(jnp.int64) != jnp.int64:
-        cell, index = jax.lax.sort((cell, index), num_keys=1)
-        return cell, index
+        values, index = jax.lax.sort((values, index), num_keys=1)
+        return values, index
     # Sorting one integer of both takes a fifth of the time.
     bits = max((n - 1).bit_length(), 1)
-    both = jax.lax.sort((cell.astype(jnp.int64) << bits) | index)
+    both = jax.lax.sort((values.astype(jnp.int64) << bits) | index)
     return (both >> bits).astype(jnp.int32), (both & (2**bits - 1)).astype(jnp.int32)
 
 
@@ -294,70 +298,62 @@ def _rows(
 
 
 def _slots(
-    grid: CellGrid,
-    rows: Rows,
-    row: Int[Array, "n"],
-    place: Int[Array, "n"],
-    order: Int[Array, "n"],
+    grid: CellGrid, rows: Rows, particles: SortedParticles
 ) -> tuple[Int[Array, "n"], Int[Array, "slots"]]:
-    """Return the slot of each sorted particle, and the particle in each slot, with images.
-
-    Args:
-        grid: the cells.
-        rows: the rows of cells.
-        row: row of each sorted particle.
-        place: cell of each sorted particle in its row.
-        order: the sorted particles.
-    """
-    n = len(order)
-    slot = jnp.arange(n, dtype=jnp.int32) + take(rows.shift, row)
+    """Return the slot of each sorted particle, and the particle in each slot, with images."""
+    n = len(particles.index)
+    slot = jnp.arange(n, dtype=jnp.int32) + take(rows.shift, particles.row)
     num_slots = 2 * n + WORD  # each particle has at most one image
-    at_begin = place < grid.cells_in_reach
-    at_end = place >= grid.around_row - grid.cells_in_reach
+    at_begin = particles.place < grid.cells_in_reach
+    at_end = particles.place >= grid.around_row - grid.cells_in_reach
     turns = at_begin.astype(jnp.int32) - at_end.astype(jnp.int32)
-    image = jnp.where(turns == 0, num_slots, slot + turns * take(rows.length, row))
-    particle = jnp.zeros(num_slots, jnp.int32).at[slot].set(order)
-    return slot, particle.at[image].set(order, mode="drop")
+    image = jnp.where(turns == 0, num_slots, slot + turns * take(rows.length, particles.row))
+    particle = jnp.zeros(num_slots, jnp.int32).at[slot].set(particles.index)
+    return slot, particle.at[image].set(particles.index, mode="drop")
 
 
 def _runs(
-    grid: CellGrid,
-    rows: Rows,
-    row: Int[Array, "n"],
-    place: Int[Array, "n"],
-    slot: Int[Array, "n"],
-) -> tuple[list[Int[Array, "n"]], list[Int[Array, "n"]]]:
-    """Return the runs with which each sorted particle is compared: first slots and lengths.
+    grid: CellGrid, rows: Rows, particles: SortedParticles, slot: Int[Array, "n"]
+) -> list[SlotRun]:
+    """Return the runs with which the sorted particles, in these slots, are compared.
 
-    In its own row a particle is compared with the following ones. The neighbouring rows are half of
-    all, so that each pair of rows occurs once.
-
-    Args:
-        grid: the cells.
-        rows: the rows of cells.
-        row: row of each particle.
-        place: cell of each particle in its row.
-        slot: slot of each particle.
+    In its own row a particle is compared with the following ones.
     """
+    reach = grid.cells_in_reach
+    before = particles.place - reach
+    after = particles.place + reach + 1
+    runs = [SlotRun(slot + 1, _first_slot(grid, rows, particles.row, after) - slot - 1)]
+    for row, exists in _neighbouring_rows(grid, particles.row):
+        first = _first_slot(grid, rows, row, before)
+        count = _first_slot(grid, rows, row, after) - first
+        runs.append(SlotRun(first, jnp.where(exists, count, 0)))
+    return runs
+
+
+def _first_slot(
+    grid: CellGrid, rows: Rows, row: Int[Array, "n"], place: Int[Array, "n"]
+) -> Int[Array, "n"]:
+    """Return the first slot of the cell at a place in a row, which images continue at both ends."""
     along_row = grid.occupied[-1]
+    beyond = (place >= grid.around_row).astype(jnp.int32)
+    turns = beyond - (place < 0).astype(jnp.int32)
+    inside = jnp.minimum(place - turns * grid.around_row, along_row)
+    start = take(rows.start, row * along_row + inside)
+    return start + take(rows.shift, row) + turns * take(rows.length, row)
 
-    def slot_of(row: Int[Array, "n"], place: Int[Array, "n"]) -> Int[Array, "n"]:
-        """Return the first slot of cells of rows, which images continue at both ends."""
-        after = (place >= grid.around_row).astype(jnp.int32)
-        turns = after - (place < 0).astype(jnp.int32)
-        inside = jnp.minimum(place - turns * grid.around_row, along_row)
-        start = take(rows.start, row * along_row + inside)
-        return start + take(rows.shift, row) + turns * take(rows.length, row)
 
-    firsts = [slot + 1]
-    counts = [slot_of(row, place + grid.cells_in_reach + 1) - slot - 1]
+def _neighbouring_rows(
+    grid: CellGrid, row: Int[Array, "n"]
+) -> list[tuple[Int[Array, "n"], Bool[Array, "n"]]]:
+    """Return half of the neighbours of each row, and whether each exists; each pair occurs once."""
     *across, _ = grid.occupied
-    places = []
+    places = []  # of the row, along each axis across the rows
     box = row
     for number in reversed(across):
-        row_of_axis = jax.lax.div(box, number)
-        places.insert(0, box - row_of_axis * number)
-        box = row_of_axis
+        quotient = jax.lax.div(box, number)
+        places.insert(0, box - quotient * number)
+        box = quotient
+    neighbours = []
     for step in itertools.product((-1, 0, 1), repeat=len(across)):
         if step <= (0,) * len(across):
             continue
@@ -369,35 +365,30 @@ def _runs(
             neighbour = jnp.where(neighbour >= grid.around, neighbour - grid.around, neighbour)
             exists = exists & (neighbour < number)
             other = other * number + neighbour
-        other = jnp.where(exists, other, 0)
-        first = slot_of(other, place - grid.cells_in_reach)
-        firsts.append(first)
-        counts.append(jnp.where(exists, slot_of(other, place + grid.cells_in_reach + 1) - first, 0))
-    return firsts, counts
+        neighbours.append((jnp.where(exists, other, 0), exists))
+    return neighbours
 
 
 def _near_in_window(
     here: list[Int[Array, "n"]],
     there: list[Int[Array, "slots"]],
-    first: Int[Array, "n"],
-    count: Int[Array, "n"],
+    run: SlotRun,
     square: Float[Array, ""],
 ) -> UInt32[Array, "n"]:
-    """Return which of 32 slots from `first` on, and of the first `count`, are within the cutoff.
+    """Return which of the first 32 slots of a run are within the cutoff, as bits.
 
     Args:
         here: coordinates of the particles, as whole numbers of `STEPS`.
         there: coordinates by slot.
-        first: first slot for each particle.
-        count: number of slots with which the particle is compared.
+        run: of each particle; it may be shorter than 32 slots, or over.
         square: of the cutoff in `STEPS`.
     """
     places = jnp.arange(WORD, dtype=jnp.int32)
-    distance2 = jnp.zeros((len(first), WORD), jnp.float32)
+    distance2 = jnp.zeros((len(run.first), WORD), jnp.float32)
     for x, others in zip(here, there, strict=True):
-        apart = (_windows(others, first) - x[:, None]).astype(jnp.float32)
+        apart = (_windows(others, run.first) - x[:, None]).astype(jnp.float32)
         distance2 = distance2 + apart * apart
-    return packed((distance2 < square) & (places[None] < count[:, None]))
+    return packed((distance2 < square) & (places[None] < run.count[:, None]))
 
 
 def _windows(values: Int[Array, "slots"], first: Int[Array, "n"]) -> Int[Array, "n 32"]:

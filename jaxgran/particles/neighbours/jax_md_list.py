@@ -4,6 +4,7 @@ Only this module imports jax_md, and only for a list that jax-md builds: the imp
 and compiles some hundred programs.
 """
 
+from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any
 
@@ -11,15 +12,23 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxgran.particles.neighbours.pairs import ListedPairs
 
-def jax_md_pairs(
+MULTIPLIER_GROWTH = 1.5
+"""Ratio of successive capacities that are tried, over the capacity for a homogeneous gas."""
+
+MAX_MULTIPLIER = 100.0
+"""Multiple of the capacity for a homogeneous gas beyond which no larger one is tried."""
+
+
+def pairs_by_jax_md(
     position: Float[Array, "particles d"],
     side: Any,
     cutoff: Any,
     replicas: int,
     capacity: int,
-) -> tuple[Int[Array, "{capacity}"], Int[Array, "{capacity}"], Int[Array, ""]]:
-    """Return i, j and count of `jaxgran.particles.neighbours.lists.Pairs`.
+) -> ListedPairs:
+    """Find all pairs closer than a cutoff, as `jaxgran.particles.neighbours.lists.search_pairs`.
 
     The values must be known: jax-md chooses the number of its cells from them.
 
@@ -27,28 +36,33 @@ def jax_md_pairs(
         RuntimeError: if the list of jax-md overflows at the largest capacity that is tried.
     """
     boxes = position.reshape(replicas, -1, position.shape[-1])
-    multiplier = 1.5
-    max_multiplier = 100.0
+    multiplier = MULTIPLIER_GROWTH
     # jax-md needs both.
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
         while True:
-            allocated, update = _jax_md_list(boxes.shape, float(side), float(cutoff), multiplier)
-            lists = update(boxes, allocated(boxes[0]))
+            lists_of = _jax_md_lists(boxes.shape, float(side), float(cutoff), multiplier)
+            lists = lists_of(boxes)
             if not bool(jnp.any(lists.did_buffer_overflow)):
                 break
-            if multiplier > max_multiplier:
+            if multiplier > MAX_MULTIPLIER:
                 raise RuntimeError(
                     f"jax-md's neighbour list overflows even at {multiplier:.3g} times the "
-                    f"capacity of a homogeneous gas, and the limit is {max_multiplier:g}. Use "
+                    f"capacity of a homogeneous gas, and the limit is {MAX_MULTIPLIER:g}. Use "
                     "neighbours='cells'"
                 )
-            multiplier *= 1.5
-    return _flatten(lists.idx, boxes.shape[1], capacity)
+            multiplier *= MULTIPLIER_GROWTH
+    i, j, count = _flattened(lists.idx, boxes.shape[1], capacity)
+    return ListedPairs(i, j, count, lookahead=jnp.zeros((), jnp.int32))
 
 
 @lru_cache(maxsize=8)
-def _jax_md_list(shape: tuple[int, ...], side: float, cutoff: float, multiplier: float):
-    # jax-md returns closures, which would be compiled again at every call without this cache.
+def _jax_md_lists(
+    shape: tuple[int, ...], side: float, cutoff: float, multiplier: float
+) -> Callable[[Float[Array, "replicas N d"]], Any]:
+    """Return a function that builds jax-md's list of each box.
+
+    jax-md returns closures, which would be compiled again at every call without the cache.
+    """
     from jax_md import partition, space
 
     shortest, _ = space.periodic(jnp.asarray(side))
@@ -59,20 +73,22 @@ def _jax_md_list(shape: tuple[int, ...], side: float, cutoff: float, multiplier:
         capacity_multiplier=multiplier,
         format=partition.NeighborListFormat.OrderedSparse,
     )
-    lists = []
+    update = jax.jit(jax.vmap(functions.update, in_axes=(0, None)))
+    allocated = []
 
-    def allocated(position):
-        """Allocate a list at the first call; later positions update it."""
-        if not lists:
-            lists.append(functions.allocate(position, extra_capacity=1))  # it may be empty
-        return lists[0]
+    def lists_of(boxes: Float[Array, "replicas N d"]) -> Any:
+        if not allocated:  # the first positions decide the capacity, later ones update the list
+            allocated.append(functions.allocate(boxes[0], extra_capacity=1))  # it may be empty
+        return update(boxes, allocated[0])
 
-    return allocated, jax.jit(jax.vmap(functions.update, in_axes=(0, None)))
+    return lists_of
 
 
 @partial(jax.jit, static_argnums=(1, 2))
-def _flatten(index: Int[Array, "replicas 2 most"], num_particles: int, capacity: int):
-    """Return i, j and count of `Pairs` from jax-md's lists, one for each replica."""
+def _flattened(
+    index: Int[Array, "replicas 2 most"], num_particles: int, capacity: int
+) -> tuple[Int[Array, "{capacity}"], Int[Array, "{capacity}"], Int[Array, ""]]:
+    """Return i, j and count of `ListedPairs` from jax-md's lists, one for each replica."""
     first = num_particles * jnp.arange(len(index), dtype=jnp.int32)[:, None]
     is_pair = jnp.ravel(index[:, 0] < num_particles)
     (rows,) = jnp.nonzero(is_pair, size=capacity, fill_value=0)

@@ -1,53 +1,23 @@
-"""The list of pairs of particles in a periodic box, by any method."""
-
-from typing import NamedTuple
+"""The list of pairs of particles in a periodic box, by any method, and the choice of the method."""
 
 import jax
-import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Float
 
-from jaxgran.particles.neighbours.cells import cells
-from jaxgran.particles.neighbours.jax_md_list import jax_md_pairs
-from jaxgran.particles.neighbours.sweep import sweep
+from jaxgran.particles.neighbours.cells import pairs_by_cells
+from jaxgran.particles.neighbours.jax_md_list import pairs_by_jax_md
+from jaxgran.particles.neighbours.pairs import ListedPairs
+from jaxgran.particles.neighbours.sweep import pairs_by_sweep
 
-ENGINES = ("auto", "sweep", "cells", "jax-md")
-"""Methods of building neighbour lists: `sweep` and `cells` in compiled code, or jax-md on the
-device; "auto" is the fastest of them."""
+COMPILED_SEARCHES = {"sweep": pairs_by_sweep, "cells": pairs_by_cells}
+"""Methods of building neighbour lists in compiled code, by name."""
+
+ENGINES = ("auto", *COMPILED_SEARCHES, "jax-md")
+"""Methods of building neighbour lists: in compiled code, or by jax-md on the device; "auto" is the
+fastest of them."""
 
 MAX_LOOKAHEAD = 450
 """Expected look-ahead, in particles, up to which a sweep is as fast as cells: some
 5000 spheres have it."""
-
-
-class Pairs(NamedTuple):
-    """Pairs of particles closer than a cutoff, each once.
-
-    Attributes:
-        i, j: indices into the particles of all replicas; rows beyond `count` are (0, 0).
-        offset: multiple of the box side in each direction, such that ``x_i - x_j - offset`` is the
-            shortest displacement of the pair. It remains valid while particles move without being
-            wrapped.
-        count: number of pairs. If it exceeds the capacity of the list, pairs are missing.
-        lookahead: look-ahead, in particles, that a sweep or cells needed. If it exceeds their
-            capacity, pairs are missing. 0 for jax-md.
-    """
-
-    i: Int[Array, "pairs"]
-    j: Int[Array, "pairs"]
-    offset: Float[Array, "pairs d"]
-    count: Int[Array, ""]
-    lookahead: Int[Array, ""]
-
-    @property
-    def in_use(self) -> Bool[Array, "pairs"]:
-        """Whether each row holds a pair."""
-        return jnp.arange(len(self.i), dtype=jnp.int32) < self.count
-
-
-def wrap(side: ArrayLike, position: Float[Array, "n d"]) -> Float[Array, "n d"]:
-    """Move positions by multiples of the side into [0, side)."""
-    inside = jnp.mod(position, side)
-    return jnp.where(inside >= side, 0.0, inside)  # rounding may give exactly `side`
 
 
 def check_engine(name: str) -> None:
@@ -68,12 +38,12 @@ def compiled_engine(name: str, ahead: float) -> str:
         name: one of `ENGINES`.
         ahead: expected look-ahead of a sweep, in particles.
     """
-    if name in ("sweep", "cells"):
+    if name in COMPILED_SEARCHES:
         return name
     return "sweep" if ahead <= MAX_LOOKAHEAD else "cells"
 
 
-def choose_engine(name: str, compiled: str, traced: bool) -> str:
+def choose_engine(name: str, compiled: str, *, traced: bool) -> str:
     """Return the engine that builds neighbour lists in a run, one of `ENGINES` but not "auto".
 
     "auto" is jax-md on an accelerator, outside of compiled code.
@@ -89,16 +59,14 @@ def choose_engine(name: str, compiled: str, traced: bool) -> str:
     return compiled
 
 
-ListedPairs = tuple[Int[Array, "pairs"], Int[Array, "pairs"], Int[Array, ""], Int[Array, ""]]
-"""Fields i, j, count and lookahead of `Pairs`."""
-
-
 def search_pairs(
     position: Float[Array, "particles d"],
     side: ArrayLike,
     cutoff: ArrayLike,
+    *,
     replicas: int,
-    capacity: tuple[int, int],
+    capacity: int,
+    ahead: int,
     engine: str,
 ) -> ListedPairs:
     """Find all pairs closer than a cutoff in each of several equal periodic boxes.
@@ -113,25 +81,17 @@ def search_pairs(
         cutoff: distance in the same unit, > 0 and at most half a side; for a sweep less than that
             by at least a part in 10^6.
         replicas: number of boxes; particles of different boxes form no pairs.
-        capacity: capacity of the list, in pairs, and of the look-ahead, in particles.
+        capacity: largest number of pairs in the list.
+        ahead: largest look-ahead of a sweep or cells, in particles.
         engine: "sweep", "cells" or "jax-md". All return the same pairs, but may differ in pairs
             within rounding error of the cutoff.
+
+    Raises:
+        ValueError: if the number of particles times `ahead` is too large for 32-bit indices.
+        RuntimeError: if jax-md's own list overflows, see `jax_md_list.MAX_MULTIPLIER`.
     """
     position, side, cutoff = jax.lax.stop_gradient((position, side, cutoff))
-    max_pairs, ahead = capacity
     if engine == "jax-md":
-        i, j, count = jax_md_pairs(position, side, cutoff, replicas, max_pairs)
-        return i, j, count, jnp.zeros((), jnp.int32)
-    search = {"sweep": sweep, "cells": cells}[engine]
-    return search(position, side, cutoff, replicas=replicas, capacity=max_pairs, ahead=ahead)
-
-
-@jax.jit
-def with_offsets(
-    position: Float[Array, "particles d"], side: ArrayLike, listed: ListedPairs
-) -> Pairs:
-    """Add the offsets to the pairs that were found for these positions."""
-    position, side = jax.lax.stop_gradient((position, jnp.asarray(side)))
-    i, j, count, lookahead = listed
-    offset = side * jnp.round((position[i] - position[j]) / side)
-    return Pairs(i, j, offset, count, lookahead)
+        return pairs_by_jax_md(position, side, cutoff, replicas, capacity)
+    search = COMPILED_SEARCHES[engine]
+    return search(position, side, cutoff, replicas=replicas, capacity=capacity, ahead=ahead)

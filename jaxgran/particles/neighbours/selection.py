@@ -23,7 +23,8 @@ class Selection(NamedTuple):
         real: which of them hold a pair.
         members: particles, in increasing order; n in empty slots.
         first, second: slots of both particles of each pair among the members.
-        counts: numbers of pairs and of members.
+        num_rows: number of selected pairs. If it exceeds the capacity, pairs are missing.
+        num_members: number of members. If it exceeds the capacity, members are missing.
     """
 
     rows: Int[Array, "rows"]
@@ -31,7 +32,8 @@ class Selection(NamedTuple):
     members: Int[Array, "members"]
     first: Int[Array, "rows"]
     second: Int[Array, "rows"]
-    counts: list[Int[Array, ""]]
+    num_rows: Int[Array, ""]
+    num_members: Int[Array, ""]
 
 
 def select_members(
@@ -39,7 +41,9 @@ def select_members(
     i: Int[Array, "all"],
     j: Int[Array, "all"],
     others: Bool[Array, "n"],
-    capacity: tuple[int, int],
+    *,
+    max_rows: int,
+    max_members: int,
 ) -> Selection:
     """Return the selected pairs, with the particles that belong to them or to `others`.
 
@@ -47,16 +51,17 @@ def select_members(
         selected: mask of the pairs.
         i, j: indices of both particles of each pair.
         others: mask of further members.
-        capacity: largest numbers of pairs and of members.
+        max_rows: capacity for pairs.
+        max_members: capacity for members.
     """
     n = len(others)
-    rows, num_rows = rows_where(selected, capacity[0])
-    real = jnp.arange(capacity[0], dtype=jnp.int32) < num_rows
+    rows, num_rows = rows_where(selected, max_rows)
+    real = jnp.arange(max_rows, dtype=jnp.int32) < num_rows
     rows = jnp.where(real, rows, 0)
     ends = jnp.stack([i[rows], j[rows]])
     is_member = marked(others, ends, real[None])
-    members, num_members = rows_where(is_member, capacity[1])
-    slots = jnp.arange(capacity[1], dtype=jnp.int32)
+    members, num_members = rows_where(is_member, max_members)
+    slots = jnp.arange(max_members, dtype=jnp.int32)
     slot = jnp.zeros(n, jnp.int32).at[members].set(slots, mode="drop")
     first, second = jnp.where(real[None], slot[ends], 0)
-    return Selection(rows, real, members, first, second, [num_rows, num_members])
+    return Selection(rows, real, members, first, second, num_rows, num_members)

@@ -4,12 +4,19 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int, UInt32
 
 from jaxgran.particles.bit_masks import WORD, bits_where
-from jaxgran.particles.neighbours.cells import STEPS, num_words_ahead, reach_in_steps
+from jaxgran.particles.neighbours.comparisons import (
+    STEPS,
+    num_words_ahead,
+    reach_in_steps,
+    squared_reach,
+)
+from jaxgran.particles.neighbours.pairs import ListedPairs
 
-_X_STEPS = 2.0**30  # grid steps per box side along x, in a sweep
+X_STEPS = 2.0**30
+"""Number of steps of x per side of a box: the box and its next image have different numbers."""
 
 
 def unsorted_share(num_particles: int) -> float:
@@ -22,7 +29,7 @@ def _index_bits(num_particles: int) -> int:
 
 
 @partial(jax.jit, static_argnames=("replicas", "capacity", "ahead"))
-def sweep(
+def pairs_by_sweep(
     position: Float[Array, "particles d"],
     side: ArrayLike,
     cutoff: ArrayLike,
@@ -30,15 +37,15 @@ def sweep(
     replicas: int,
     capacity: int,
     ahead: int,
-) -> tuple[Int[Array, "{capacity}"], Int[Array, "{capacity}"], Int[Array, ""], Int[Array, ""]]:
+) -> ListedPairs:
     """Find all pairs closer than a cutoff, in each of several equal periodic boxes.
 
     The method is sweep and prune: the particles of each box are sorted by x, and every particle is
     compared with the following ones, up to the cutoff along x: ``N cutoff / side`` particles in a
     homogeneous gas. Coordinates are rounded to a grid of whole numbers, whose differences are
-    periodic by integer overflow (along x by a second copy of the box). One bit per comparison says
-    whether the pair is within the cutoff. The work grows as ``N^(2 - 1/d)``. For boxes of up to
-    some ten thousand particles this is faster than a cell list, and it needs no call to the host.
+    periodic by integer overflow (along x by a second copy of the box). The work grows as
+    ``N^(2 - 1/d)``. For boxes of up to some ten thousand particles this is faster than a cell list,
+    and it needs no call to the host.
 
     Args:
         position: positions of all particles, replica after replica, in [0, side).
@@ -61,55 +68,88 @@ def sweep(
     num_words = num_words_ahead("sweep", min(ahead, n), replicas * n, 1)
     unit = position.reshape(replicas, n, position.shape[-1]) / side
     unit = jnp.where(unit >= 1, 0.0, unit)  # by rounding
+    order = _order_along_x(unit)
+    here = _in_steps(jnp.take_along_axis(unit, order[..., None], axis=1))
+    there = _continued(here)
 
-    # Sorting one integer of the coarse coordinate x and the index takes a tenth of the time of
-    # sorting two arrays.
-    bits = _index_bits(n)
-    coarse = (unit[..., 0] * 2.0 ** (31 - bits)).astype(jnp.int32) << bits
-    order = jax.lax.sort(coarse | jnp.arange(n, dtype=jnp.int32)[None]) & (2**bits - 1)
-    unit = jnp.take_along_axis(unit, order[..., None], axis=1)
-
-    # Coordinates as whole numbers of steps, continued periodically: the next image of the box
-    # follows the last particle, and then padding at a large distance.
-    here = [(unit[..., 0] * _X_STEPS).astype(jnp.int32)]
-    here += [((unit[..., k] - 0.5) * STEPS).astype(jnp.int32) for k in range(1, unit.shape[-1])]
-    images = [here[0] + int(_X_STEPS), *here[1:]]
-    end = jnp.full((replicas, 2 * WORD), jnp.iinfo(jnp.int32).max)
-    ahead_of = [jnp.concatenate([x, y, end], axis=1) for x, y in zip(here, images, strict=True)]
-
-    def following(axis: int, block: Array, count: int) -> Int[Array, "replicas {count}"]:
-        first = WORD * block + 1
-        return jax.lax.dynamic_slice_in_dim(ahead_of[axis], first, count, axis=1)
-
-    # The cutoff in steps of y and z, and along x in steps of x, enlarged by the rounding errors.
-    reach_steps, square = reach_in_steps(cutoff, side, position)
-    square = jnp.minimum(square, (STEPS / 2) ** 2)  # beyond, pairs would occur twice
-    along_x = (reach_steps * (_X_STEPS / STEPS)).astype(jnp.int32) + 2 ** max(bits - 1, 1)
+    reach = reach_in_steps(cutoff, side, position.dtype)
+    square = jnp.minimum(squared_reach(reach), (STEPS / 2) ** 2)  # beyond, pairs would occur twice
+    along_x = (reach * (X_STEPS / STEPS)).astype(jnp.int32) + _unsorted_steps(n)
     finite = jnp.all(jnp.isfinite(position))
 
-    def compare_block(carry):
+    def following(axis: int, block: Int[Array, ""], count: int) -> Int[Array, "replicas {count}"]:
+        """Return coordinates of the particle after each one, from a block of comparisons on."""
+        return jax.lax.dynamic_slice_in_dim(there[axis], WORD * block + 1, count, axis=1)
+
+    def compare_block(carry: tuple) -> tuple:
         block, words = carry
         window = [following(axis, block, n + WORD - 1) for axis in range(len(here))]
-        word = jnp.zeros((replicas, n), jnp.uint32)
-        for bit in range(WORD):
-            apart = [
-                (there[:, bit : bit + n] - x).astype(jnp.float32)
-                for there, x in zip(window, here, strict=True)
-            ]
-            apart[0] *= STEPS / _X_STEPS
-            near = sum(a * a for a in apart) < square
-            word |= near.astype(jnp.uint32) << bit
-        return block + 1, words.at[block].set(word, mode="drop")
+        return block + 1, words.at[block].set(_near_in_window(here, window, square), mode="drop")
 
-    def unfinished(carry):
+    def unfinished(carry: tuple) -> Array:
         block, _ = carry
         nearest = jnp.min(following(0, block, n) - here[0])
         return finite & (WORD * block + 1 < n) & (nearest <= along_x)
 
     words = jnp.zeros((num_words, replicas, n), jnp.uint32)
-    blocks, words = jax.lax.while_loop(unfinished, compare_block, (jnp.int32(0), words))
+    num_blocks, words = jax.lax.while_loop(unfinished, compare_block, (jnp.int32(0), words))
+    i, j, count = _pairs_of_bits(words, order, capacity)
+    return ListedPairs(i, j, count, lookahead=jnp.minimum(WORD * num_blocks, n - 1))
 
-    # The two particles of the pair of each set bit.
+
+def _order_along_x(unit: Float[Array, "replicas n d"]) -> Int[Array, "replicas n"]:
+    """Return the particles of each box in the order of coarse steps of x."""
+    # Sorting one integer of the coarse coordinate and the index takes a tenth of the time of
+    # sorting two arrays.
+    n = unit.shape[1]
+    bits = _index_bits(n)
+    coarse = (unit[..., 0] * 2.0 ** (31 - bits)).astype(jnp.int32) << bits
+    return jax.lax.sort(coarse | jnp.arange(n, dtype=jnp.int32)[None]) & (2**bits - 1)
+
+
+def _unsorted_steps(num_particles: int) -> int:
+    """Return the length of a coarse step of x, within which particles are not sorted."""
+    return 2 ** max(_index_bits(num_particles) - 1, 1)
+
+
+def _in_steps(unit: Float[Array, "replicas n d"]) -> list[Int[Array, "replicas n"]]:
+    """Return coordinates over the side along each axis as whole numbers of steps."""
+    x = (unit[..., 0] * X_STEPS).astype(jnp.int32)
+    others = [((unit[..., k] - 0.5) * STEPS).astype(jnp.int32) for k in range(1, unit.shape[-1])]
+    return [x, *others]
+
+
+def _continued(here: list[Int[Array, "replicas n"]]) -> list[Int[Array, "replicas more"]]:
+    """Return coordinates, then those of the next image of the box, and far ones as padding."""
+    image = [here[0] + int(X_STEPS), *here[1:]]
+    end = jnp.full((len(here[0]), 2 * WORD), jnp.iinfo(jnp.int32).max)
+    return [jnp.concatenate([x, y, end], axis=1) for x, y in zip(here, image, strict=True)]
+
+
+def _near_in_window(
+    here: list[Int[Array, "replicas n"]],
+    window: list[Int[Array, "replicas more"]],
+    square: Float[Array, ""],
+) -> UInt32[Array, "replicas n"]:
+    """Return which of 32 particles in a window behind each particle are within the cutoff."""
+    n = here[0].shape[1]
+    word = jnp.zeros(here[0].shape, jnp.uint32)
+    for bit in range(WORD):
+        apart = [
+            (there[:, bit : bit + n] - x).astype(jnp.float32)
+            for there, x in zip(window, here, strict=True)
+        ]
+        apart[0] *= STEPS / X_STEPS
+        near = sum(a * a for a in apart) < square
+        word |= near.astype(jnp.uint32) << bit
+    return word
+
+
+def _pairs_of_bits(
+    words: UInt32[Array, "words replicas n"], order: Int[Array, "replicas n"], capacity: int
+) -> tuple[Int[Array, "{capacity}"], Int[Array, "{capacity}"], Int[Array, ""]]:
+    """Return i < j of the pair of each set bit, and the number of pairs."""
+    replicas, n = order.shape
     word, bit, count = bits_where(words.ravel(), capacity)
     index = word % (replicas * n)
     first = n * (index // n)
@@ -118,4 +158,4 @@ def sweep(
     particle = (order + n * jnp.arange(replicas, dtype=jnp.int32)[:, None]).ravel()
     in_use = jnp.arange(capacity, dtype=jnp.int32) < count
     i, j = (jnp.where(in_use, particle.at[k].get(mode="clip"), 0) for k in (index, there))
-    return jnp.minimum(i, j), jnp.maximum(i, j), count, jnp.minimum(WORD * blocks, n - 1)
+    return jnp.minimum(i, j), jnp.maximum(i, j), count

@@ -21,7 +21,7 @@ from jaxgran.gradients.tangents import ContactTangents, RateSums, component_alon
 from jaxgran.particles import observables
 from jaxgran.particles.bit_masks import rows_where
 from jaxgran.particles.capacity import Capacity, max_skin
-from jaxgran.particles.neighbours.lists import Pairs, wrap
+from jaxgran.particles.neighbours.pairs import Pairs, wrap
 from jaxgran.particles.neighbours.selection import marked, select_members
 from jaxgran.particles.soft.forces import (
     PAIR,
@@ -353,7 +353,9 @@ class SoftDynamics(AbstractSphereDynamics):
         active = marked(extra | alone, ends, touching[None])
         active = marked(active, ends, (real & (active[i] | active[j]))[None])
         selected = real & (active[i] | active[j])
-        found = select_members(selected, i, j, alone, self.capacity[3:])
+        max_rows = self.capacity.contacts
+        max_members = self.capacity.members
+        found = select_members(selected, i, j, alone, max_rows=max_rows, max_members=max_members)
         i = i[found.rows]
         j = j[found.rows]
         # An empty row is a pair out of reach.
@@ -366,7 +368,9 @@ class SoftDynamics(AbstractSphereDynamics):
             replica=i // (n // self.replicas),
             expected=active[i] & active[j],
             expected_at_walls=active.at[found.members].get(mode="fill", fill_value=True),
-            needed=jnp.stack([pairs.count, pairs.lookahead, num_near, *found.counts]),
+            needed=jnp.stack(
+                [pairs.count, pairs.lookahead, num_near, found.num_rows, found.num_members]
+            ),
         )
 
     def _hottest(self, state: SphereState) -> Float[Array, ""]:
