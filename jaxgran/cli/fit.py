@@ -20,6 +20,7 @@ import numpy as np
 
 import jaxgran
 from jaxgran import plotting
+from jaxgran._utils.extras import import_extra
 from jaxgran.cli.common import FitOptions, models_by_name
 from jaxgran.cli.page import (
     Section,
@@ -29,7 +30,6 @@ from jaxgran.cli.page import (
     sections_of_plan,
     write_page,
 )
-from jaxgran.data.curve import import_extra
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.files import name_in_errors
 from jaxgran.data.header import OPTIONAL_KEYS, PRIOR_KEYS, absent_of_header

@@ -11,10 +11,10 @@ import numpy as np
 
 import jaxgran
 from jaxgran import plotting
+from jaxgran._utils.extras import import_extra
 from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.cli.fit import as_json, parse_settings
 from jaxgran.cli.page import command_of, question_of, sections_of_plan, write_page
-from jaxgran.data.curve import import_extra
 from jaxgran.data.files import check_writable, name_in_errors, write_atomically
 from jaxgran.data.header import gas_of_header
 from jaxgran.data.measurement_file import arguments_of_header

@@ -19,11 +19,14 @@ import numpy as np
 
 from jaxgran._utils.validation import check_bool
 from jaxgran.data import files, tracks
-from jaxgran.data.curve import QUANTITIES, CoolingCurve, check_values, from_arrays, to_arrays
+from jaxgran.data.curve import CoolingCurve, from_arrays
+from jaxgran.data.curve_arrays import to_arrays
+from jaxgran.data.curve_checks import check_values
 from jaxgran.data.definitions import BY_COLUMN, TEMPERATURE_COLUMNS
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.drop_test_file import drop_test_columns, drop_test_of_table, is_drop_test
 from jaxgran.data.header import checked_header, gas_or_none, missing_keys
+from jaxgran.data.quantities import QUANTITIES
 from jaxgran.data.questions import ask_about_columns, ask_about_speeds, scene_of
 from jaxgran.data.tables import (
     UNIT_KEYS,

@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxgran.data import files
-from jaxgran.data.curve import MIN_POINTS, QUANTITIES, CoolingCurve, above_noise
+from jaxgran.data.curve import MIN_POINTS, CoolingCurve, above_noise
 from jaxgran.data.definitions import Scene, other_definitions
+from jaxgran.data.quantities import QUANTITIES
 from jaxgran.data.tables import UNITS, unit_in
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass

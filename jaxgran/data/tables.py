@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxgran.data.curve import QUANTITIES
 from jaxgran.data.files import read_bytes
+from jaxgran.data.quantities import QUANTITIES
 from jaxgran.scene.parameters import BY_SYMBOL
 
 UNIT_KEYS = {"length_unit": "m", "time_unit": "s", "speed_unit": "m/s"}

@@ -10,9 +10,10 @@ import numpy as np
 import scipy  # which imports scipy.stats at its first use
 from jaxtyping import Float, Int
 
-from jaxgran.data.curve import MIN_POINTS, CoolingCurve, check_values, from_arrays
+from jaxgran.data.curve import MIN_POINTS, CoolingCurve, from_arrays
+from jaxgran.data.curve_checks import check_values
 from jaxgran.data.files import header_count, header_number, positive_number
-from jaxgran.data.particles import GSD_DEFAULT, Frame, open_frames
+from jaxgran.data.particle_file import GSD_DEFAULT, Frame, open_frames
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass
 

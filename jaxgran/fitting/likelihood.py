@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxgran.data.curve import DEFAULTS, CoolingCurve
+from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.measurement import START_TIME, Measurement
+from jaxgran.data.run_options import DEFAULTS
 from jaxgran.fitting.innovations import Nodes, filtered, log_density_change, log_ratio
 from jaxgran.fitting.measured_rows import curve_rows, with_rate_error
 from jaxgran.fitting.parameters import guess_from_data

@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 from tqdm import tqdm
 
-from jaxgran.data.curve import CoolingCurve, Run
+from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.run_options import Run
 from jaxgran.fitting.comparison import Comparison
 from jaxgran.fitting.information import FEW_PARTICLES, decrease_with_variance, inverse
 from jaxgran.fitting.parameters import with_parameters
@@ -98,7 +99,7 @@ class Simulations:
         theory: the same measurement for kinetic theory, which knows how N grains scatter.
         key: of the random numbers.
         progress: whether to show progress bars.
-        starts: of equilibrated spheres, which all runs share and add to (`jaxgran.data.curve.Run`).
+        starts: of equilibrated spheres, which all runs share and add to (`jaxgran.extend.Run`).
             They depend on no parameter of the law, and velocities are drawn anew.
     """
 
