@@ -32,8 +32,10 @@ from jaxgran.cli.page import (
 )
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.files import name_in_errors
-from jaxgran.data.header import OPTIONAL_KEYS, PRIOR_KEYS, absent_of_header
-from jaxgran.data.tables import UNIT_KEYS, header_in_si
+from jaxgran.data.header_keys import OPTIONAL_KEYS, PRIOR_KEYS
+from jaxgran.data.header_lines import header_in_si
+from jaxgran.data.measurement_header import absent_of_header
+from jaxgran.data.units import UNIT_KEYS
 from jaxgran.fitting.messages import NOT_DETERMINED, SIGNIFICANCE
 from jaxgran.fitting.report import parameter_rows, report
 from jaxgran.models.choose import default_models

@@ -18,9 +18,10 @@ import jaxgran
 from jaxgran.cli import common
 from jaxgran.data.curve_file import ARCHIVE_SUFFIX, CSV_SUFFIXES
 from jaxgran.data.files import check_writable, header_count, header_number, name_in_errors
-from jaxgran.data.header import gas_of_header, guesses_of_header
+from jaxgran.data.header import gas_of_header
+from jaxgran.data.header_keys import TRACK_KEYS
+from jaxgran.data.measurement_header import guesses_of_header
 from jaxgran.data.scene_file import read_scene_file
-from jaxgran.data.tracks import TRACK_KEYS
 from jaxgran.models.checks import check_volume
 from jaxgran.models.choose import NUM_PARTICLES, default_models
 from jaxgran.scene.elements import container_volume_ratio

@@ -17,7 +17,7 @@ from jaxgran.cli.fit import as_json, parse_settings
 from jaxgran.cli.page import command_of, question_of, sections_of_plan, write_page
 from jaxgran.data.files import check_writable, name_in_errors, write_atomically
 from jaxgran.data.header import gas_of_header
-from jaxgran.data.measurement_file import arguments_of_header
+from jaxgran.data.measurement_header import arguments_of_header
 from jaxgran.data.scene_file import errors_of, read_scene_file, times_of
 from jaxgran.fitting.twins import twin
 

@@ -26,16 +26,11 @@ from jaxgran.data.definitions import BY_COLUMN, TEMPERATURE_COLUMNS
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.drop_test_file import drop_test_columns, drop_test_of_table, is_drop_test
 from jaxgran.data.header import checked_header, gas_or_none, missing_keys
+from jaxgran.data.header_lines import header_entry, header_in_si, text_of_comment
 from jaxgran.data.quantities import QUANTITIES
 from jaxgran.data.questions import ask_about_columns, ask_about_speeds, scene_of
-from jaxgran.data.tables import (
-    UNIT_KEYS,
-    Table,
-    header_entry,
-    header_in_si,
-    read_table,
-    text_of_comment,
-)
+from jaxgran.data.tables import Table, read_table
+from jaxgran.data.units import UNIT_KEYS
 
 WANTED = "t,T[,T_err][,msd][,msd_err]"
 """Columns of a file, for messages."""

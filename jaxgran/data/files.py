@@ -140,7 +140,7 @@ def positive_number(header: Mapping[str, Any], key: str) -> float:
     return number
 
 
-def header_count(header: dict[str, str], key: str) -> int | None:
+def header_count(header: Mapping[str, Any], key: str) -> int | None:
     """Return the value of a key in the header of a curve, such as N, as a positive whole number.
 
     Returns:

@@ -19,7 +19,7 @@ from jaxgran._utils.validation import (
 )
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.drop_test import DropTest
-from jaxgran.data.header import ABSENT
+from jaxgran.data.header_keys import ABSENT
 from jaxgran.data.quantities import QUANTITIES
 from jaxgran.scene.gas import Gas
 

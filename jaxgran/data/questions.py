@@ -16,7 +16,7 @@ from jaxgran.data import files
 from jaxgran.data.curve import MIN_POINTS, CoolingCurve, above_noise
 from jaxgran.data.definitions import Scene, other_definitions
 from jaxgran.data.quantities import QUANTITIES
-from jaxgran.data.tables import UNITS, unit_in
+from jaxgran.data.units import UNITS, unit_in
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass
 from jaxgran.scene.parameters import REQUIRED

@@ -20,10 +20,12 @@ from jaxgran.data.curve_file import CSV_FILE
 from jaxgran.data.drop_test import MAX_SIGMAS, SPHERE, WALL, DropTest
 from jaxgran.data.encounters import Encounters, find_encounters
 from jaxgran.data.flights import MIN_FRAMES, Breaks, error_by_scatter, flights_between
-from jaxgran.data.header import checked_header, gas_of_header, priors_of_header
+from jaxgran.data.header import checked_header, gas_of_header
+from jaxgran.data.header_lines import header_in_si
 from jaxgran.data.measurement import Measurement
+from jaxgran.data.measurement_header import priors_of_header
 from jaxgran.data.motion import Motion, error_by_second_differences
-from jaxgran.data.tables import header_in_si, read_table
+from jaxgran.data.tables import read_table
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.parameters import MATERIAL, PARAMETERS
 

@@ -22,8 +22,6 @@ IDENTITIES = ("track_id", "id", "particle")
 CLOCKS = ("t", "frame")
 """Names of columns of tracks, in order of preference; some are used by TrackMate and trackpy."""
 
-TRACK_KEYS = ("box_side", "frame_rate", "timestep", "localisation_error")
-"""Header keys of tracks and trajectories."""
 
 TRAJECTORIES = (".gsd", ".xyz", ".extxyz", ".dump", ".lammpstrj")
 """Suffixes of files that give the velocities of all particles."""

@@ -14,7 +14,7 @@ import numpy as np
 from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.drop_test import DropTest
-from jaxgran.data.header import ABSENT
+from jaxgran.data.header_keys import ABSENT
 from jaxgran.data.measurement import START_TIME, Measurement
 from jaxgran.scene.elements import Rough
 

@@ -59,7 +59,7 @@ DECLARABLE = {
     "drag": ("drag_rate", "gamma"),
     "friction": ("friction", "friction"),
 }
-"""Parameter of each of the effects `jaxgran.data.header.ABSENT`, and what describes it in a
+"""Parameter of each of the effects `jaxgran.data.header_keys.ABSENT`, and what describes it in a
 file."""
 
 SCENE_PARAMETERS = tuple(parameter for parameter, _ in DECLARABLE.values())

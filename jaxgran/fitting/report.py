@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxgran.data.curve import above_noise
 from jaxgran.data.drop_test import DropTest
-from jaxgran.data.header import GUESS
+from jaxgran.data.header_keys import GUESS
 from jaxgran.fitting.goodness import SIGNIFICANCE
 from jaxgran.fitting.result import CONDITIONAL, Fit
 from jaxgran.scene.parameters import symbol_of, unit_of
