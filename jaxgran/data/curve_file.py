@@ -22,15 +22,17 @@ from jaxgran.data import files, tracks
 from jaxgran.data.curve import CoolingCurve, from_arrays
 from jaxgran.data.curve_arrays import to_arrays
 from jaxgran.data.curve_checks import check_values
+from jaxgran.data.curve_questions import ask_about_columns, scene_of
 from jaxgran.data.definitions import BY_COLUMN, TEMPERATURE_COLUMNS
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.drop_test_file import drop_test_columns, drop_test_of_table, is_drop_test
 from jaxgran.data.header import checked_header, gas_or_none, missing_keys
 from jaxgran.data.header_lines import header_entry, header_in_si, text_of_comment
 from jaxgran.data.quantities import QUANTITIES
-from jaxgran.data.questions import ask_about_columns, ask_about_speeds, scene_of
+from jaxgran.data.questions import ask
 from jaxgran.data.tables import Table, read_table
 from jaxgran.data.units import UNIT_KEYS
+from jaxgran.data.usual_values import ask_about_speeds
 
 WANTED = "t,T[,T_err][,msd][,msd_err]"
 """Columns of a file, for messages."""
@@ -134,7 +136,7 @@ def read_data(path: Path, given: dict[str, str]) -> Content:
         gas = gas_or_none(header | {k: x for k, x in ANY_MATERIAL.items() if k in missing})
         curve, questions = tracks.curve_of_tracks(columns, header, table.lines, gas)
         if table.num_left_out:
-            questions.append(f"{table.num_left_out} positions that belong to no track are left out")
+            questions.append(ask("no track", number=table.num_left_out))
         questions += ask_about_columns(curve, header, gas_or_none(header))
         return Content(curve, header, questions)
     columns, rounding, column = _with_temperature(table, header)

@@ -16,8 +16,9 @@ from jaxgran.data.header_keys import (
     UNSUPPORTED_KEYS,
     VISCOELASTIC_KEYS,
 )
-from jaxgran.data.questions import ask_about_header
+from jaxgran.data.questions import ask
 from jaxgran.data.units import UNIT_KEYS
+from jaxgran.data.usual_values import ask_about_header
 from jaxgran.scene.elements import VOLUME_TOLERANCE, container_volume_ratio
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass
@@ -91,10 +92,7 @@ def ask_about_another_gas(header: dict[str, str], gas: Gas) -> list[str]:
         given = files.header_number(header, key)
         used = float(sphere[name])
         if abs(given - used) > MAX_DIFFERENCE * abs(used):
-            questions.append(
-                f"{key} is {given:g} in this header, but {used:.4g} in the gas that is used: "
-                "impacts of other spheres need a header of all of them, read without this gas"
-            )
+            questions.append(ask("another gas", key=key, given=given, used=used))
     return questions
 
 
@@ -104,10 +102,7 @@ def _ask_about_unknown_keys(header: dict[str, str]) -> Iterator[str]:
     # Comments that are no single word are not keys.
     unknown = [key for key in header if key.isidentifier() and key not in others]
     if unknown:
-        yield (
-            f"ignoring unknown header keys: {', '.join(unknown)}. Known keys are "
-            f"{', '.join(known)}, and errors such as eta_err"
-        )
+        yield ask("unknown keys", unknown=", ".join(unknown), known=", ".join(known))
 
 
 def gas_or_none(header: dict[str, str]) -> Gas | None:

@@ -52,9 +52,9 @@ def read_measurement(
         header: further entries of the header, before anything is read; they replace
             entries with the same key. Keys: see `jaxgran.data.header.gas_of_header` and
             `jaxgran.data.measurement_header.priors_of_header`, N, replicas, absent, tracked,
-            T0_of ("run" or "ensemble"), T_scale_err, errors ("measured"), which stand for the arguments of `Measurement`, those
-            of drop tests, onto ("sphere", "plate" or "wall"), eps_scatters ("yes") and spin_before
-            ("0"), and the keys of tracks.
+            T0_of ("run" or "ensemble"), T_scale_err, errors ("measured"), which stand for the
+            arguments of `Measurement`, those of drop tests, onto ("sphere", "plate" or "wall"),
+            eps_scatters ("yes") and spin_before ("0"), and the keys of tracks.
         gas: the gas in place of the header's, such as the gas of a curve for a drop test.
 
     Returns:
