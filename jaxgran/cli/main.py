@@ -16,10 +16,12 @@ from cyclopts import App, CycloptsError, Parameter
 
 import jaxgran
 from jaxgran.cli import common
-from jaxgran.data.curve_file import ARCHIVE_SUFFIX, CSV_SUFFIXES
-from jaxgran.data.files import check_writable, header_count, header_number, name_in_errors
+from jaxgran.data.curve_archive import ARCHIVE_SUFFIX
+from jaxgran.data.curve_file import CSV_SUFFIXES
+from jaxgran.data.files import check_writable, name_in_errors
 from jaxgran.data.header import gas_of_header
 from jaxgran.data.header_keys import TRACK_KEYS
+from jaxgran.data.header_values import header_count, header_number
 from jaxgran.data.measurement_header import guesses_of_header
 from jaxgran.data.scene_file import read_scene_file
 from jaxgran.models.checks import check_volume

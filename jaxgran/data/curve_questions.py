@@ -8,9 +8,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array
 
-from jaxgran.data import files
 from jaxgran.data.curve import MIN_POINTS, CoolingCurve, above_noise
 from jaxgran.data.definitions import Scene, other_definitions
+from jaxgran.data.header_values import header_count, header_dimension, header_number
 from jaxgran.data.quantities import QUANTITIES
 from jaxgran.data.questions import ask
 from jaxgran.data.units import unit_in
@@ -61,10 +61,10 @@ def ask_about_columns(
         return
     if not all(is_usual(key, float(header[key])) for key in REQUIRED if key in header):
         return  # `ask_about_header` asks first
-    number = files.header_count(header, "N")
+    number = header_count(header, "N")
     yield from _ask_about_start(curve, header, gas, number, column)
     if number is not None and curve.temperature_error is not None:
-        replicas = files.header_count(header, "replicas") or 1
+        replicas = header_count(header, "replicas") or 1
         yield from _ask_about_errors(curve, gas.dimension, number, replicas)
 
 
@@ -141,7 +141,7 @@ def _ask_about_start(
     """Compare T at first with T0, the clock with T0, and the loss with the mean free time."""
     header = {"t0": "0", "T0_err": "0"} | header
     positive = above_noise(curve)
-    times = np.asarray(curve.times)[positive] - files.header_number(header, "t0")
+    times = np.asarray(curve.times)[positive] - header_number(header, "t0")
     T = np.asarray(curve.temperature)[positive]
     T0 = float(gas.temperature)
     if len(T) < MIN_POINTS:
@@ -150,7 +150,7 @@ def _ask_about_start(
     if line.slope <= 0 or not np.isfinite(line.slope):
         return
     chance = 4 * sqrt(2 / (gas.dimension * number)) if number else 0.0
-    known = 3 * files.header_number(header, "T0_err") / T0
+    known = 3 * header_number(header, "T0_err") / T0
     max_ratio = MAX_RATIO + chance + known
     begin = line.time_of_T0
     if line.ratio > max_ratio:
@@ -204,15 +204,15 @@ def _scale_question(ratio: float, gas: Gas, header: dict[str, str], column: str)
 
 def scene_of(header: dict[str, str]) -> Scene:
     """Return what the factors of definitions of T depend on."""
-    spread = files.header_number({"diameter_sd": "0"} | header, "diameter_sd")
+    spread = header_number({"diameter_sd": "0"} | header, "diameter_sd")
     mass = np.nan
     if {"diameter", "density"} <= header.keys():
-        size = files.header_number(header, "diameter")
-        sphere = float(sphere_mass(size, files.header_number(header, "density")))
+        size = header_number(header, "diameter")
+        sphere = float(sphere_mass(size, header_number(header, "density")))
         mass = sphere * (1 + 3 * (spread / size) ** 2)  # the mean cube over the cube of the mean
     return Scene(
-        d=files.header_count(header, "dimension") or 3,
+        d=header_dimension(header),
         mass=mass,
-        number=files.header_count(header, "N") or np.nan,
-        T0=files.header_number({"T0": "0"} | header, "T0") or np.nan,
+        number=header_count(header, "N") or np.nan,
+        T0=header_number({"T0": "0"} | header, "T0") or np.nan,
     )

@@ -11,7 +11,7 @@ import scipy  # which imports scipy.stats at its first use
 from jaxtyping import Float
 
 from jaxgran.data.drop_test import PARTNERS, DropTest
-from jaxgran.data.files import header_number
+from jaxgran.data.header_values import header_number
 from jaxgran.data.questions import ask
 from jaxgran.data.tables import Table
 

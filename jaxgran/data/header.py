@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from jaxgran.data import files
 from jaxgran.data.header_elements import elements_of_header, header_sides
 from jaxgran.data.header_keys import (
     GUESS,
@@ -16,6 +15,7 @@ from jaxgran.data.header_keys import (
     UNSUPPORTED_KEYS,
     VISCOELASTIC_KEYS,
 )
+from jaxgran.data.header_values import header_dimension, header_number
 from jaxgran.data.questions import ask
 from jaxgran.data.units import UNIT_KEYS
 from jaxgran.data.usual_values import ask_about_header
@@ -74,7 +74,7 @@ def gas_of_header(header: dict[str, str]) -> tuple[Gas, list[str]]:
         entries["container_side"] = str(np.max(header_sides(header)))
     quantities = {*BY_SYMBOL, *PRIOR_KEYS}
     numbers = {
-        key: files.header_number(entries, key)
+        key: header_number(entries, key)
         for key in header
         if key in quantities and header[key] != GUESS
     }
@@ -89,7 +89,7 @@ def ask_about_another_gas(header: dict[str, str], gas: Gas) -> list[str]:
         name = BY_SYMBOL[key].name
         if key not in header or name not in sphere:
             continue
-        given = files.header_number(header, key)
+        given = header_number(header, key)
         used = float(sphere[name])
         if abs(given - used) > MAX_DIFFERENCE * abs(used):
             questions.append(ask("another gas", key=key, given=given, used=used))
@@ -126,8 +126,8 @@ def make_gas(header: dict[str, str]) -> Gas:
             "'# eps: VALUE', a constant restitution, replaces Y and nu)"
         )
     scene_keys = (key for key in REQUIRED if key not in VISCOELASTIC_KEYS)
-    values = {key: files.header_number(header, key) for key in scene_keys}
-    spread = files.header_number(header, "diameter_sd") if "diameter_sd" in header else None
+    values = {key: header_number(header, key) for key in scene_keys}
+    spread = header_number(header, "diameter_sd") if "diameter_sd" in header else None
     gas = Gas(
         law_of_header(header),
         diameter=values["diameter"],
@@ -139,18 +139,18 @@ def make_gas(header: dict[str, str]) -> Gas:
         **elements_of_header(header),
     )
     if gas.container is not None and "N" in header:
-        _check_number(gas, files.header_number(header, "N"))
+        _check_number(gas, header_number(header, "N"))
     return gas
 
 
 def _packing_fraction_in_container(header: dict[str, str], d: int) -> float:
     """Return the packing fraction of N spheres in a container of d dimensions."""
-    size = files.header_number(header, "diameter")
+    size = header_number(header, "diameter")
     sphere = pi / 6 * size**3 if d == 3 else pi / 4 * size**2
-    spread = files.header_number({"diameter_sd": "0"} | header, "diameter_sd") / size
+    spread = header_number({"diameter_sd": "0"} | header, "diameter_sd") / size
     sphere *= 1 + (2 * d - 3) * spread**2
     volume = np.prod(np.broadcast_to(header_sides(header), d))
-    return float(files.header_number(header, "N") * sphere / volume)
+    return float(header_number(header, "N") * sphere / volume)
 
 
 def _check_number(gas: Gas, number: float) -> None:
@@ -162,11 +162,6 @@ def _check_number(gas: Gas, number: float) -> None:
             f"N, eta and container_side contradict: {number:g} spheres in this container have "
             f"eta = {eta * ratio:.4g}, but the header gives {eta:.4g}; correct one of them"
         )
-
-
-def header_dimension(header: Mapping[str, str]) -> int:
-    """Return the dimension of the gas, 3 unless the header gives another one."""
-    return files.header_count(header, "dimension") or 3
 
 
 def missing_keys(header: Mapping[str, str]) -> list[str]:
@@ -183,11 +178,11 @@ def law_of_header(header: dict[str, str]) -> RestitutionLaw:
     """
     if "eps" not in header:
         entries = {"A": "0"} | header
-        Y, nu, A = (files.header_number(entries, key) for key in VISCOELASTIC_KEYS)
+        Y, nu, A = (header_number(entries, key) for key in VISCOELASTIC_KEYS)
         return Viscoelastic(Y, nu, A)
     if both := [key for key in VISCOELASTIC_KEYS if key in header]:
         raise ValueError(
             f"the header gives eps, a constant restitution, and {', '.join(both)} of viscoelastic "
             f"spheres: leave out eps or {', '.join(both)}"
         )
-    return ConstantRestitution(files.header_number(header, "eps"))
+    return ConstantRestitution(header_number(header, "eps"))

@@ -4,8 +4,8 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from jaxgran.data import files
 from jaxgran.data.header_keys import GUESS, GUESSES, UNSUPPORTED_KEYS
+from jaxgran.data.header_values import header_number
 from jaxgran.scene.elements import Frictional, Rough, Walls
 from jaxgran.scene.gas import ELEMENTS
 from jaxgran.scene.parameters import fields_of
@@ -50,7 +50,7 @@ def elements_of_header(header: dict[str, str]) -> dict[str, Any]:
 def _check_supported(header: dict[str, str]) -> None:
     """Raise ValueError for a key of an effect that no model has."""
     for key, (neutral, reason) in UNSUPPORTED_KEYS.items():
-        if key in header and (neutral is None or files.header_number(header, key) != neutral):
+        if key in header and (neutral is None or header_number(header, key) != neutral):
             advice = "" if neutral is None else f" or set it to {neutral:g}"
             raise ValueError(
                 f"the header gives {key}: {reason}. No model of jaxgran supports it; fit a curve "
@@ -80,14 +80,14 @@ def _arguments(kind: type, header: dict[str, str]) -> dict[str, Any]:
         if key == "container_side":
             arguments[fields[key]] = header_sides(values)
         else:
-            arguments[fields[key]] = files.header_number(values, key)
+            arguments[fields[key]] = header_number(values, key)
     return arguments
 
 
 def header_sides(header: Mapping[str, Any]) -> float | list[float]:
     """Return the side of a cubic or square container, or its d sides, m."""
     sides = [
-        files.header_number({"container_side": part.strip()}, "container_side")
+        header_number({"container_side": part.strip()}, "container_side")
         for part in str(header["container_side"]).split("x")
     ]
     return sides if len(sides) > 1 else sides[0]

@@ -3,8 +3,8 @@
 import re
 from typing import Any
 
-from jaxgran.data import files
 from jaxgran.data.header_keys import ABSENT, GUESS, GUESSES, PRIOR_KEYS
+from jaxgran.data.header_values import header_count, header_number
 from jaxgran.scene.parameters import BY_SYMBOL
 
 EXACT_DENSITY_ERROR = 1e-4
@@ -18,13 +18,13 @@ def arguments_of_header(header: dict[str, str]) -> dict[str, Any]:
         ValueError: for a value that is not allowed.
     """
     return {
-        "num_particles": files.header_count(header, "N"),
-        "replicas": files.header_count(header, "replicas") or 1,
+        "num_particles": header_count(header, "N"),
+        "replicas": header_count(header, "replicas") or 1,
         "priors": priors_of_header(header),
         "absent": absent_of_header(header),
-        "tracked": files.header_count(header, "tracked"),
+        "tracked": header_count(header, "tracked"),
         "ensemble_start": _choice(header, "T0_of", ("run", "ensemble")) == "ensemble",
-        "calibration_error": files.header_number({"T_scale_err": "0"} | header, "T_scale_err"),
+        "calibration_error": header_number({"T_scale_err": "0"} | header, "T_scale_err"),
         "errors_measured": _choice(header, "errors", ("any", "measured")) == "measured",
         "of_energy": _choice(header, "T_of", ("velocity", "energy")) == "energy",
         "guesses": guesses_of_header(header),
@@ -60,17 +60,17 @@ def priors_of_header(header: dict[str, str]) -> dict[str, tuple[float, float]]:
         value_key = key.removesuffix("_err")
         if value_key not in header and value_key != "t0":
             raise ValueError(f"the header gives {key} without {value_key}; add the value itself")
-        error = files.header_number(header, key)
+        error = header_number(header, key)
         if error <= 0:
             raise ValueError(
                 f"header line {key}: must be a positive number, got {header[key]!r}; leave it out "
                 f"if {value_key} is known exactly"
             )
-        priors[name] = files.header_number({"t0": "0"} | header, value_key), error
+        priors[name] = header_number({"t0": "0"} | header, value_key), error
     if "diameter" in priors and "density" not in priors:
         if "density" not in header:
             raise ValueError("the header gives diameter_err without density; add the density")
-        density = files.header_number(header, "density")
+        density = header_number(header, "density")
         priors["density"] = (density, EXACT_DENSITY_ERROR * density)
     return priors
 

@@ -17,7 +17,8 @@ import numpy as np
 
 from jaxgran._utils.extras import import_extra
 from jaxgran._utils.validation import checked_int
-from jaxgran.data.files import MAX_COUNT, checked_path, name_in_errors, read_bytes
+from jaxgran.data.files import checked_path, name_in_errors, read_bytes
+from jaxgran.data.header_values import MAX_COUNT
 from jaxgran.data.particles import Particles
 
 GSD = ".gsd"
