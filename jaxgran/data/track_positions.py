@@ -6,6 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Num
 
+from jaxgran.data.header_values import positive_number
+
 COORDINATES = ("x", "y", "z")
 IDENTITIES = ("track_id", "id", "particle")
 CLOCKS = ("t", "frame")
