@@ -14,9 +14,9 @@ from jaxtyping import Array, Float, Int
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.measurement import START_TIME, Measurement
 from jaxgran.data.run_options import DEFAULTS
+from jaxgran.fitting.guesses import guess_from_data
 from jaxgran.fitting.innovations import Nodes, filtered, log_density_change, log_ratio
 from jaxgran.fitting.measured_rows import curve_rows, with_rate_error
-from jaxgran.fitting.parameters import guess_from_data
 from jaxgran.fitting.prediction import times_with_nodes
 from jaxgran.fitting.rows import CALIBRATION, ROTATION, CurveRows, Displacement
 from jaxgran.models.base import AbstractModel

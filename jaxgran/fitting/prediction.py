@@ -15,7 +15,8 @@ from jaxtyping import Bool, Float, Int
 
 from jaxgran._utils.tracing import grid_size
 from jaxgran.data.measurement import START_TIME
-from jaxgran.fitting.parameters import as_floats, power_of_line, with_parameters
+from jaxgran.fitting.guesses import power_of_line
+from jaxgran.fitting.parameters import as_floats, with_parameters
 from jaxgran.fitting.rows import CALIBRATION, FLOOR, ROTATION, SCATTER, WHITE, CurveRows
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.linearise import LinearisedCurve, linearise

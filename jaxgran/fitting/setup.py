@@ -9,15 +9,10 @@ import numpy as np
 
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import START_TIME, Measurement, Priors
+from jaxgran.fitting.guesses import guess_from_data, guess_from_drops, guess_start_time
 from jaxgran.fitting.measured_rows import curve_rows, with_rate_error
-from jaxgran.fitting.parameters import (
-    as_floats,
-    guess_from_data,
-    guess_from_drops,
-    guess_start_time,
-    known_start_time,
-    with_parameters,
-)
+from jaxgran.fitting.parameters import as_floats, with_parameters
+from jaxgran.fitting.priors import known_start_time
 from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.rows import CurveRows, DropRows
 from jaxgran.models.base import AbstractModel

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.data.curve import CoolingCurve
-from jaxgran.data.measurement import Measurement
+from jaxgran.data.measurement import Measurement, Priors
 from jaxgran.fitting.alternatives import Explanations, compare_alternatives
 from jaxgran.fitting.comparison import Residuals
 from jaxgran.fitting.estimate import (
@@ -29,15 +29,9 @@ from jaxgran.fitting.information import (
 )
 from jaxgran.fitting.measured_rows import curve_rows, with_rate_error
 from jaxgran.fitting.messages import say
-from jaxgran.fitting.parameters import (
-    SMOOTHNESS,
-    Priors,
-    as_floats,
-    extra_parameters,
-    prior_residuals,
-    with_parameters,
-)
+from jaxgran.fitting.parameters import as_floats, with_parameters
 from jaxgran.fitting.prediction import predicted_curve
+from jaxgran.fitting.priors import SMOOTHNESS, extra_parameters, prior_residuals
 from jaxgran.fitting.problem import Problem, summed
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.search import Descent, Minimum
