@@ -80,18 +80,39 @@ def curve_rows(
     return rows, notes
 
 
-def _has_rotation(measurement: Measurement) -> bool:
-    measured = measurement.curve.rotational_temperature
-    return measurement.gas.surface is not None and measured is not None
+def with_rate_error(rows: CurveRows, model: AbstractModel, gas: Gas) -> CurveRows:
+    """Return a curve with the error of a model's cooling rate in a gas.
+
+    Args:
+        rows: the measured curve.
+        model: of the fit; kinetic theory gives the curve on which the error of a stochastic one
+            depends.
+        gas: the scene, with values of the unknowns.
+    """
+    known = np.asarray(rows.curve.times) * rows.faster
+    times, _ = times_with_nodes(known, rows.unit_time)
+    exact = KineticTheory() if model.stochastic else model
+    curve = curve_of_program(exact, gas, times, rows.displacement is not None)
+    if not np.all(np.isfinite(np.asarray(curve.temperature))):
+        return rows
+    error_model = error_model_of_curve(gas, curve, rows.measurement.num_particles)
+    error = np.broadcast_to(model.rate_error(error_model), times.shape)
+    return replace(rows, rate_error=RateError(times, np.asarray(error, float)))
 
 
-def _values(measurement: Measurement) -> Float[np.ndarray, "times 2"]:
-    """Return the measured T and T_rot, which is 1 where it is not compared."""
-    T = np.asarray(measurement.curve.temperature)
-    T_rot = np.ones_like(T)
-    if _has_rotation(measurement):
-        T_rot = np.asarray(measurement.curve.rotational_temperature)
-    return np.stack([T, T_rot], axis=1)
+def with_errors_that_count(measurement: Measurement) -> Measurement:
+    """Return a measurement whose errors are those that a fit counts, as errors of measurement."""
+    exact = replace(measurement, rounding={})
+    errors = errors_that_count(exact).errors
+    fields: dict[str, Any] = {}
+    for column, name in enumerate(("temperature_error", "rotational_temperature_error")):
+        known = getattr(measurement.curve, name) is not None and np.any(errors[:, column] > 0)
+        fields[name] = jnp.asarray(errors[:, column]) if known else None
+    if measurement.curve.displacement is not None:
+        error = _displacement_errors(measurement).errors
+        fields["displacement_error"] = jnp.asarray(error) if np.any(error > 0) else None
+    data = replace(measurement.curve, **fields)
+    return replace(measurement, data=data, errors_measured=True)
 
 
 class CountedErrors(NamedTuple):
@@ -118,70 +139,6 @@ def errors_that_count(measurement: Measurement) -> CountedErrors:
     both = np.stack([of_T.errors, of_rotation.errors], axis=1)
     notes = of_T.notes + of_rotation.notes
     return CountedErrors(np.hypot(both, rounding_errors(measurement)), notes)
-
-
-def with_errors_that_count(measurement: Measurement) -> Measurement:
-    """Return a measurement whose errors are those that a fit counts, as errors of measurement."""
-    exact = replace(measurement, rounding={})
-    errors = errors_that_count(exact).errors
-    fields: dict[str, Any] = {}
-    for column, name in enumerate(("temperature_error", "rotational_temperature_error")):
-        known = getattr(measurement.curve, name) is not None and np.any(errors[:, column] > 0)
-        fields[name] = jnp.asarray(errors[:, column]) if known else None
-    if measurement.curve.displacement is not None:
-        error = _displacement_errors(measurement).errors
-        fields["displacement_error"] = jnp.asarray(error) if np.any(error > 0) else None
-    data = replace(measurement.curve, **fields)
-    return replace(measurement, data=data, errors_measured=True)
-
-
-def _used(
-    measurement: Measurement,
-    values: Float[np.ndarray, "times 2"],
-    errors: Float[np.ndarray, "times 2"],
-    fits_T_0: bool,
-) -> Float[np.ndarray, "times 2"]:
-    """Return 1 where a value counts, 0 elsewhere.
-
-    A value at t = 0 is the T_0 of the run, unless it has an error beyond its rounding.
-    """
-    curve = measurement.curve
-    used = np.ones_like(values)
-    used[:, 1] = float(_has_rotation(measurement))
-    if np.asarray(curve.times)[0] == 0:
-        of_T, of_rotation = errors[0] > BEYOND_ROUNDING * rounding_errors(measurement)[0]
-        used[0, 0] = float(of_T or fits_T_0)
-        used[0, 1] *= float(of_rotation)
-    error = curve.rotational_temperature_error
-    used[:, 1] *= (values[:, 1] > 0) | (np.asarray(0.0 if error is None else error) > 0)
-    return used
-
-
-def _grains(measurement: Measurement, fits_T_0: bool) -> Grains:
-    N = measurement.num_particles
-    is_ensemble = measurement.ensemble_start and not fits_T_0
-    return Grains(
-        inverse_number=1 / ((UNKNOWN_NUMBER if N is None else N) * measurement.replicas),
-        log_error=WEAK_SCATTER if N is None else SCATTER_ERROR,
-        sample=sampling_variance(measurement),
-        first=2 / measurement.gas.dimension if is_ensemble else 0.0,
-    )
-
-
-def sampling_variance(measurement: Measurement) -> float:
-    """Return the variance of ln T where some of the grains are tracked; 0 if all are."""
-    tracked = measurement.tracked
-    if tracked is None:
-        return 0.0
-    N = measurement.num_particles
-    left = 1 - (0 if N is None else tracked / N)
-    return 2 / (measurement.gas.dimension * tracked * measurement.replicas) * left
-
-
-def _finite_size_factor(measurement: Measurement) -> float:
-    """Return the factor by which the measured gas cools faster because N is small."""
-    N = measurement.num_particles
-    return 1.0 if N is None else float(finite_size_cooling_factor(measurement.gas, float_array(N)))
 
 
 def _errors_of_measurement(
@@ -233,6 +190,87 @@ def _equals_fluctuation(error: np.ndarray, values: np.ndarray, number: int) -> b
     """Return whether errors are the fluctuation of a mean square of independent components."""
     ratio = error[error > 0] / (2 / number) ** 0.5 / values[error > 0]
     return bool(ratio.size and np.all(np.abs(ratio - 1) < ERRORS_OF_PARTICLES))
+
+
+def _has_rotation(measurement: Measurement) -> bool:
+    measured = measurement.curve.rotational_temperature
+    return measurement.gas.surface is not None and measured is not None
+
+
+def _values(measurement: Measurement) -> Float[np.ndarray, "times 2"]:
+    """Return the measured T and T_rot, which is 1 where it is not compared."""
+    T = np.asarray(measurement.curve.temperature)
+    T_rot = np.ones_like(T)
+    if _has_rotation(measurement):
+        T_rot = np.asarray(measurement.curve.rotational_temperature)
+    return np.stack([T, T_rot], axis=1)
+
+
+def _used(
+    measurement: Measurement,
+    values: Float[np.ndarray, "times 2"],
+    errors: Float[np.ndarray, "times 2"],
+    fits_T_0: bool,
+) -> Float[np.ndarray, "times 2"]:
+    """Return 1 where a value counts, 0 elsewhere.
+
+    A value at t = 0 is the T_0 of the run, unless it has an error beyond its rounding.
+    """
+    curve = measurement.curve
+    used = np.ones_like(values)
+    used[:, 1] = float(_has_rotation(measurement))
+    if np.asarray(curve.times)[0] == 0:
+        of_T, of_rotation = errors[0] > BEYOND_ROUNDING * rounding_errors(measurement)[0]
+        used[0, 0] = float(of_T or fits_T_0)
+        used[0, 1] *= float(of_rotation)
+    error = curve.rotational_temperature_error
+    used[:, 1] *= (values[:, 1] > 0) | (np.asarray(0.0 if error is None else error) > 0)
+    return used
+
+
+def _grains(measurement: Measurement, fits_T_0: bool) -> Grains:
+    N = measurement.num_particles
+    is_ensemble = measurement.ensemble_start and not fits_T_0
+    return Grains(
+        inverse_number=1 / ((UNKNOWN_NUMBER if N is None else N) * measurement.replicas),
+        log_error=WEAK_SCATTER if N is None else SCATTER_ERROR,
+        sample=sampling_variance(measurement),
+        first=2 / measurement.gas.dimension if is_ensemble else 0.0,
+    )
+
+
+def sampling_variance(measurement: Measurement) -> float:
+    """Return the variance of ln T where some of the grains are tracked; 0 if all are."""
+    tracked = measurement.tracked
+    if tracked is None:
+        return 0.0
+    N = measurement.num_particles
+    left = 1 - (0 if N is None else tracked / N)
+    return 2 / (measurement.gas.dimension * tracked * measurement.replicas) * left
+
+
+def _finite_size_factor(measurement: Measurement) -> float:
+    """Return the factor by which the measured gas cools faster because N is small."""
+    N = measurement.num_particles
+    return 1.0 if N is None else float(finite_size_cooling_factor(measurement.gas, float_array(N)))
+
+
+@eqx.filter_jit
+def finite_size_cooling_factor(gas: Gas, num_particles: ArrayLike) -> Float[Array, ""]:
+    """Factor by which N particles without total momentum cool faster than many, at the same T.
+
+    Their relative velocities have the temperature ``T' = T N/(N-1)``, and each particle
+    collides with N - 1 others: with ``-d ln T/dt = r(T)`` the factor is r(T')/r(T), here with the
+    loss ``1 - eps^2`` at the impact speed sqrt(2 T): 1 + .6/N for viscoelastic spheres, 1 + .5/N
+    for a constant eps. It is 1 between walls, which take up momentum.
+    """
+    if gas.container is not None:
+        return jnp.ones_like(gas.temperature)
+    hotter = jnp.sqrt(num_particles / jnp.maximum(num_particles - 1, 1.0))
+    one = jnp.ones_like(gas.temperature)
+    loss = 1 - gas.reduced_law.restitution(one) ** 2
+    ratio = (1 - gas.reduced_law.restitution(hotter * one) ** 2) / jnp.where(loss > 0, loss, 1.0)
+    return hotter * jnp.where(loss > 0, ratio, 1.0)
 
 
 def _displacement(
@@ -314,41 +352,3 @@ def unused_rotation(measurement: Measurement) -> str | None:
         "the measured T_rot is not used: the gas has no surface=jaxgran.Rough(...) (header key "
         "beta_t)"
     )
-
-
-@eqx.filter_jit
-def finite_size_cooling_factor(gas: Gas, num_particles: ArrayLike) -> Float[Array, ""]:
-    """Factor by which N particles without total momentum cool faster than many, at the same T.
-
-    Their relative velocities have the temperature ``T' = T N/(N-1)``, and each particle
-    collides with N - 1 others: with ``-d ln T/dt = r(T)`` the factor is r(T')/r(T), here with the
-    loss ``1 - eps^2`` at the impact speed sqrt(2 T): 1 + .6/N for viscoelastic spheres, 1 + .5/N
-    for a constant eps. It is 1 between walls, which take up momentum.
-    """
-    if gas.container is not None:
-        return jnp.ones_like(gas.temperature)
-    hotter = jnp.sqrt(num_particles / jnp.maximum(num_particles - 1, 1.0))
-    one = jnp.ones_like(gas.temperature)
-    loss = 1 - gas.reduced_law.restitution(one) ** 2
-    ratio = (1 - gas.reduced_law.restitution(hotter * one) ** 2) / jnp.where(loss > 0, loss, 1.0)
-    return hotter * jnp.where(loss > 0, ratio, 1.0)
-
-
-def with_rate_error(rows: CurveRows, model: AbstractModel, gas: Gas) -> CurveRows:
-    """Return a curve with the error of a model's cooling rate in a gas.
-
-    Args:
-        rows: the measured curve.
-        model: of the fit; kinetic theory gives the curve on which the error of a stochastic one
-            depends.
-        gas: the scene, with values of the unknowns.
-    """
-    known = np.asarray(rows.curve.times) * rows.faster
-    times, _ = times_with_nodes(known, rows.unit_time)
-    exact = KineticTheory() if model.stochastic else model
-    curve = curve_of_program(exact, gas, times, rows.displacement is not None)
-    if not np.all(np.isfinite(np.asarray(curve.temperature))):
-        return rows
-    error_model = error_model_of_curve(gas, curve, rows.measurement.num_particles)
-    error = np.broadcast_to(model.rate_error(error_model), times.shape)
-    return replace(rows, rate_error=RateError(times, np.asarray(error, float)))

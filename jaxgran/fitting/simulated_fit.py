@@ -199,12 +199,12 @@ def _residuals(search: Search, expansion: Expansion) -> Residuals:
     """Return the residuals of the measured values and their derivatives in the unknowns."""
     (whole,) = search.average.comparison.residuals(0)
     return Residuals(
-        "curve",
-        "",
-        expansion.residuals,
-        -expansion.sensitivity,
-        whole.log_variance + np.log(expansion.scatter),
-        np.zeros_like(expansion.sensitivity),
+        name="curve",
+        label="",
+        values=expansion.residuals,
+        slopes=-expansion.sensitivity,
+        log_variance=whole.log_variance + np.log(expansion.scatter),
+        log_slopes=np.zeros_like(expansion.sensitivity),
     )
 
 
@@ -244,5 +244,5 @@ def _explanations(
     problem = problem_with_rate_errors(replace(problem, measurements=(moved,)), start)
     is_driven = rows.scene.drive is not None
     errors = np.sqrt(np.diag(noise))
-    minimum = Minimum(start, 0.0, 0, True)
+    minimum = Minimum(start, value=0.0, steps=0, converged=True)
     return compare_alternatives(problem, [minimum], errors, is_driven)
