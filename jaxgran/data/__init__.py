@@ -13,8 +13,8 @@
 - `questions`: all questions about unusual data; `usual_values` and `curve_questions` choose them.
 - `tracks`: T(t) from positions in frames (`track_positions`, `displacements`, `velocity_memory`).
 - `track_impacts`: impacts from tracks, in the steps `motion`, `encounters`, `flights`, `contacts`.
-- `particle_file` reads files of particles, `trajectory_curve` T(t) from them; `trajectory` writes
-  them.
+- `particle_file` reads files of particles, frame by frame (`particle_frame`), and
+  `trajectory_curve` T(t) from them; `trajectory` writes them.
 - `checkpoint`: the state of a run in a file. `scene_file`: TOML files of a scene. `lammps`: input
   for LAMMPS. `example`: the measurement that comes with the package. `files`: reading and writing.
 

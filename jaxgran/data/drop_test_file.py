@@ -25,7 +25,6 @@ SPINS = ("wx", "wy", "wz")
 SPINS_AFTER = tuple(f"{name}_after" for name in SPINS)
 """Columns of velocities, unit vectors from the partner to the sphere, and angular velocities."""
 
-
 EPS_RANGE = (0.0, 1.2)
 """Allowed eps, and |eps_t|, of a file; beyond 1 it is also compared with its error."""
 

@@ -10,7 +10,8 @@ import numpy as np
 from jaxgran.data.curve import CoolingCurve, from_arrays
 from jaxgran.data.curve_checks import check_values
 from jaxgran.data.header_values import header_count, header_number, positive_number
-from jaxgran.data.particle_file import GSD_DEFAULT, Frame, open_frames
+from jaxgran.data.particle_file import GSD_DEFAULT, open_frames
+from jaxgran.data.particle_frame import Frame
 from jaxgran.scene.geometry import sphere_mass
 
 TRAJECTORIES = (".gsd", ".xyz", ".extxyz", ".dump", ".lammpstrj")
