@@ -14,7 +14,7 @@ from jaxgran.data.displacements import CHANCE, MIN_TRACKS, Step, steps_of_tracks
 from jaxgran.data.header_values import header_count, header_dimension, header_number
 from jaxgran.data.questions import ask
 from jaxgran.data.track_positions import identities_of
-from jaxgran.data.velocity_memory import NUM_ITERATIONS, displacement_factor, fit_memory
+from jaxgran.data.velocity_memory import NUM_ITERATIONS, Memory, displacement_factor, fit_memory
 from jaxgran.scene.gas import Gas
 
 MAX_CORRECTION = 0.3
@@ -118,19 +118,10 @@ def curve_of_tracks(
     T = factor * T
     error = factor * error
     localisation_error = _given_localisation_error(header)
-    enskog = None
-    if gas is not None:
-        enskog = 2 / gas.dimension * float(gas.replace(temperature=1.0).collision_frequency)
-    memory = fit_memory(usable, T, enskog, localisation_error)
+    memory = _memory(usable, T, gas, localisation_error, remarks)
     if memory.localisation_error is not None:
         localisation_error = memory.localisation_error
         header = header | {"localisation_error": repr(localisation_error)}
-        remarks.notes.append(
-            f"localisation_error not given, and estimated as {localisation_error:.2g} m"
-        )
-        remarks.questions.append(ask("unknown localisation", error=localisation_error))
-    if memory.rate_ratio is not None and abs(memory.rate_ratio - 1) > MAX_RATE_ERROR:
-        remarks.questions.append(ask("rate", ratio=memory.rate_ratio))
     duration = np.array([step.duration for step in usable])
     T = _without_localisation_error(T, duration, localisation_error, remarks)
     true = _without_impacts(T, duration, memory.rate, remarks)
@@ -233,6 +224,27 @@ def _given_localisation_error(header: dict[str, str]) -> float | None:
     if error < 0:
         raise ValueError(f"header line localisation_error: must be >= 0, got {error:g}")
     return error
+
+
+def _memory(
+    steps: list[Step],
+    T: Float[np.ndarray, "steps"],
+    gas: Gas | None,
+    localisation_error: float | None,
+    remarks: _Remarks,
+) -> Memory:
+    """Return how fast the velocities are forgotten, after a comparison with Enskog's theory."""
+    enskog = None
+    if gas is not None:
+        enskog = 2 / gas.dimension * float(gas.replace(temperature=1.0).collision_frequency)
+    memory = fit_memory(steps, T, enskog, localisation_error)
+    estimated = memory.localisation_error
+    if estimated is not None:
+        remarks.notes.append(f"localisation_error not given, and estimated as {estimated:.2g} m")
+        remarks.questions.append(ask("unknown localisation", error=estimated))
+    if memory.rate_ratio is not None and abs(memory.rate_ratio - 1) > MAX_RATE_ERROR:
+        remarks.questions.append(ask("rate", ratio=memory.rate_ratio))
+    return memory
 
 
 def _without_localisation_error(
