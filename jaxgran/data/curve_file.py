@@ -18,8 +18,8 @@ from jaxgran.data import files
 from jaxgran.data.curve import CoolingCurve, from_arrays
 from jaxgran.data.curve_archive import ARCHIVE_SUFFIX, read_archive, write_archive
 from jaxgran.data.curve_checks import check_values
-from jaxgran.data.curve_questions import ask_about_columns, scene_of
-from jaxgran.data.definitions import BY_COLUMN, TEMPERATURE_COLUMNS
+from jaxgran.data.curve_questions import ask_about_columns
+from jaxgran.data.definitions import BY_COLUMN, TEMPERATURE_COLUMNS, facts_of
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.drop_test_file import drop_test_columns, drop_test_of_table, is_drop_test
 from jaxgran.data.header import checked_header, gas_or_none, missing_keys
@@ -226,15 +226,15 @@ def _read_temperature(table: Table) -> _Temperature:
             f"line {table.lines[i]}: {name} is {values[i]:g}, it must be a positive number; "
             "correct or remove this row"
         )
-    scene = scene_of(header)
-    if "energy" in name and np.isnan(scene.mass):
+    facts = facts_of(header)
+    if "energy" in name and np.isnan(facts.mass):
         raise ValueError(
             f"a column {name} needs the mass of a particle: add diameter and density to the "
             "header, or give T = <v^2>/d itself"
         )
-    if name == "total_energy" and np.isnan(scene.number):
+    if name == "total_energy" and np.isnan(facts.number):
         raise ValueError("a column of the energy of all particles needs N: add it to the header")
-    factor = definition.factor(scene)
+    factor = definition.factor(facts)
     columns["T"] = factor * values**power
     formula = name if power == 1 else f"{name}^{power}"
     header["T_from"] = f"T = {factor:.4g} {formula}: it is {definition.words}"

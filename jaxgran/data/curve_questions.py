@@ -9,14 +9,13 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxgran.data.curve import MIN_POINTS, CoolingCurve, above_noise
-from jaxgran.data.definitions import Scene, other_definitions
-from jaxgran.data.header_values import header_count, header_dimension, header_number
+from jaxgran.data.definitions import facts_of, other_definitions
+from jaxgran.data.header_values import header_count, header_number
 from jaxgran.data.quantities import QUANTITIES
 from jaxgran.data.questions import ask
 from jaxgran.data.units import unit_in
 from jaxgran.data.usual_values import OTHER_UNITS, is_usual, unit_question
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.geometry import sphere_mass
 from jaxgran.scene.parameters import REQUIRED
 
 MAX_RATIO = 1.3
@@ -48,7 +47,7 @@ def ask_about_columns(
         rounding: last digits as they were written, by field.
         column: from which T was read.
     """
-    if column == "mean_speed" and scene_of(header).d == 3:
+    if column == "mean_speed" and facts_of(header).d == 3:
         yield ask("mean_speed")
     yield from _ask_about_digits(curve, rounding or {})
     for quantity in QUANTITIES.values():
@@ -192,7 +191,7 @@ def _scale_question(ratio: float, gas: Gas, header: dict[str, str], column: str)
     """
     T0 = float(gas.temperature)
     causes = []
-    for definition, factor in other_definitions(ratio, column, scene_of(header)):
+    for definition, factor in other_definitions(ratio, column, facts_of(header)):
         rename = ask("rename", column=definition.column) if definition.column else ""
         what = "it" if definition.power == 1 else "T"
         causes.append(
@@ -200,19 +199,3 @@ def _scale_question(ratio: float, gas: Gas, header: dict[str, str], column: str)
         )
     question = ". Or ".join(causes) or ask("any definition")
     return ask("scale", first=ratio * T0, ratio=ratio, T0=T0, question=question)
-
-
-def scene_of(header: dict[str, str]) -> Scene:
-    """Return what the factors of definitions of T depend on."""
-    spread = header_number({"diameter_sd": "0"} | header, "diameter_sd")
-    mass = np.nan
-    if {"diameter", "density"} <= header.keys():
-        size = header_number(header, "diameter")
-        sphere = float(sphere_mass(size, header_number(header, "density")))
-        mass = sphere * (1 + 3 * (spread / size) ** 2)  # the mean cube over the cube of the mean
-    return Scene(
-        d=header_dimension(header),
-        mass=mass,
-        number=header_count(header, "N") or np.nan,
-        T0=header_number({"T0": "0"} | header, "T0") or np.nan,
-    )
