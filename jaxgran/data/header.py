@@ -127,7 +127,9 @@ def make_gas(header: dict[str, str]) -> Gas:
         )
     scene_keys = (key for key in REQUIRED if key not in VISCOELASTIC_KEYS)
     values = {key: header_number(header, key) for key in scene_keys}
-    spread = header_number(header, "diameter_sd") if "diameter_sd" in header else None
+    spread: Any = None
+    if "diameter_sd" in header:
+        spread = header_number(header, "diameter_sd")
     gas = Gas(
         law_of_header(header),
         diameter=values["diameter"],
