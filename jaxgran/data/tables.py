@@ -163,7 +163,7 @@ def read_table(
     comma = _decimal_comma(kept, places.values(), lines.separator)
     values = [_numbers(i, row, places.values(), comma, lines) for i, row in kept.items()]
     columns = {}
-    for name, numbers in zip(chosen, np.reshape(values, (len(kept), len(chosen))).T, strict=True):
+    for name, numbers in zip(places, np.reshape(values, (len(kept), len(places))).T, strict=True):
         columns[name] = numbers * factors[name]
     try:
         columns |= _absolute_errors(columns, units)
@@ -174,8 +174,8 @@ def read_table(
         columns=columns,
         lines=list(kept),
         cells={name: [row[k] for row in kept.values()] for name, k in places.items()},
-        factors={name: factors[name] for name in chosen},
-        units={name: units_given[name] for name in chosen},
+        factors={name: factors[name] for name in places},
+        units={name: units_given[name] for name in places},
         num_left_out=len(rows) - len(kept),
     )
 
