@@ -20,7 +20,6 @@ from typing import Any
 from jaxgran import extend as extend
 from jaxgran._utils.status import explain as explain_status
 from jaxgran.data.curve import CoolingCurve as CoolingCurve
-from jaxgran.data.curve import Particles as Particles
 from jaxgran.data.curve_file import read_curve as read_curve
 from jaxgran.data.curve_file import write_curve as write_curve
 from jaxgran.data.drop_test import DropTest as DropTest
@@ -28,7 +27,8 @@ from jaxgran.data.example import example_measurement as example_measurement
 from jaxgran.data.lammps import lammps_commands as lammps_commands
 from jaxgran.data.measurement import Measurement as Measurement
 from jaxgran.data.measurement_file import read_measurement as read_measurement
-from jaxgran.data.particles import read_particles as read_particles
+from jaxgran.data.particle_file import read_particles as read_particles
+from jaxgran.data.particles import Particles as Particles
 from jaxgran.data.track_impacts import Impacts as Impacts
 from jaxgran.data.track_impacts import read_impacts as read_impacts
 from jaxgran.fitting.alternatives import Alternative as Alternative

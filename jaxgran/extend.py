@@ -17,7 +17,7 @@ lists what it leaves out, each as a `Limitation`.
 """
 
 from jaxgran._utils.validation import Domain as Domain
-from jaxgran.data.curve import Run as Run
+from jaxgran.data.run_options import Run as Run
 from jaxgran.models.base import AbstractModel as AbstractModel
 from jaxgran.models.base import Limitation as Limitation
 from jaxgran.models.error_model import ErrorModel as ErrorModel

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxgran.data.curve import CoolingCurve, above_noise, import_extra
+from jaxgran._utils.extras import import_extra
+from jaxgran.data.curve import CoolingCurve, above_noise
 from jaxgran.data.files import write_atomically
 from jaxgran.fitting.plan import OPEN_WIDTH, Plan
 from jaxgran.fitting.result import Fit

@@ -29,10 +29,13 @@ from jaxtyping import Array, ArrayLike, Float, Key, PRNGKeyArray
 from tqdm import tqdm
 
 from jaxgran._utils import status
+from jaxgran._utils.extras import import_extra
 from jaxgran._utils.validation import check_bool, checked_int, checked_times
-from jaxgran.data import curve as curves
 from jaxgran.data.checkpoint import describe_run
-from jaxgran.data.curve import STATUS, TIME, CoolingCurve, Particles
+from jaxgran.data.curve import CoolingCurve, from_arrays
+from jaxgran.data.curve_arrays import STATUS, TIME, label_of, to_arrays
+from jaxgran.data.particles import Particles
+from jaxgran.data.quantities import QUANTITIES
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.cool import cool
@@ -204,7 +207,7 @@ def sweep(
         arrays[STATUS][rows] = faults  # last: the chunk is complete now
     _wait_for_all("all chunks are finished")
     known = {name: jnp.asarray(arrays[name][:]) for name in _records(like)}
-    return jax.vmap(lambda known: curves.from_arrays({"times": times} | known, like))(known)
+    return jax.vmap(lambda known: from_arrays({"times": times} | known, like))(known)
 
 
 def _checked_members(gases: Any, key: Any) -> tuple[Gas, Key[Array, "members"], list[str]]:
@@ -329,7 +332,7 @@ def _run_member(gas: Gas, key: PRNGKeyArray, *, model, times, save) -> CoolingCu
 
 def _records(curve: CoolingCurve) -> dict[str, Any]:
     """Return the arrays of a member by name, without the times, which all members share."""
-    return {name: array for name, array in curves.to_arrays(curve).items() if name != "times"}
+    return {name: array for name, array in to_arrays(curve).items() if name != "times"}
 
 
 def _run_chunk(
@@ -398,7 +401,7 @@ def _labels(gases: Gas, swept: list[str], times: np.ndarray) -> dict[str, tuple]
     labels = {MEMBER: (MEMBER, np.arange(number)), TIME: (TIME, times, {"units": "s"})}
     for name in swept:
         values = np.asarray(gases.value(name))
-        label = f"initial_{name}" if name in curves.QUANTITIES else name
+        label = f"initial_{name}" if name in QUANTITIES else name
         dims = (MEMBER, *(f"{label}_{k}" for k in range(values.ndim - 1)))
         if np.all(values == values[:1]):
             dims = dims[1:]
@@ -415,8 +418,8 @@ def _open_store(
     are_particles: bool,
 ) -> Any:
     """Return the Zarr group of a sweep; create it, with all labels and no finished chunk."""
-    zarr = curves.import_extra("zarr", "sweep")
-    xarray = curves.import_extra("xarray", "sweep")
+    zarr = import_extra("zarr", "sweep")
+    xarray = import_extra("xarray", "sweep")
     if _stored_identity(path) is None and jax.process_index() == 0:
         variables = {}
         encoding = {}
@@ -425,7 +428,7 @@ def _open_store(
                 dims = ()
                 attributes = {"long_name": "faults, see jaxgran.explain_status"}
             else:
-                dims, attributes = curves.label_of(name, values.ndim - 1, are_particles)
+                dims, attributes = label_of(name, values.ndim - 1, are_particles)
             variables[name] = (MEMBER, *dims), values, attributes
             fill = _empty(name, values.dtype)
             encoding[name] = {"chunks": (identity["chunk"], *values.shape[1:]), "fill_value": fill}
@@ -466,9 +469,7 @@ def _stored_identity(path: Path) -> dict[str, Any] | None:
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return None
     try:
-        return dict(
-            curves.import_extra("zarr", "sweep").open_group(path, mode="r").attrs[ATTRIBUTE]
-        )
+        return dict(import_extra("zarr", "sweep").open_group(path, mode="r").attrs[ATTRIBUTE])
     except Exception as error:  # zarr raises any type for a folder that holds something else
         raise ValueError(
             f"{path} is not the store of a sweep ({error}). Name another folder, or remove it."

@@ -9,7 +9,7 @@ UNCHECKED = {
     "data.drop_test": {"DropTest.__init__"},
     "data.measurement": {"Measurement.__init__"},
     "data.measurement_file": {"read_measurement"},
-    "data.particles": {"read_particles"},
+    "data.particle_file": {"read_particles"},
     "fitting.fit": {"fit"},
     "fitting.learnt_law": {"restitution_band"},
     "fitting.likelihood": {"log_likelihood"},

@@ -34,7 +34,7 @@ import pytest
 
 import jaxgran
 from jaxgran import Rough, StokesDrag, Walls, WhiteNoise
-from jaxgran.data.curve import QUANTITIES
+from jaxgran.data.quantities import QUANTITIES
 from jaxgran.scene.parameters import PARAMETER_UNITS
 from tests.beads import assert_same, beads, glass_beads, lattice, total_energy
 from tests.own_model import HaffLaw

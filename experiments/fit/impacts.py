@@ -151,7 +151,7 @@ def curve_measurement(film: Film, gas: jaxgran.Gas, error: float, seed: int) -> 
     """Return T(t) of the positions, at every tenth frame interval."""
     columns = columns_of(film, error, seed)
     header = header_of(film, error)
-    curve, _ = curve_of_tracks(columns, header, list(range(columns["t"].size)), gas)
+    curve = curve_of_tracks(columns, header, list(range(columns["t"].size)), gas).curve
     few = slice(None, None, 10)
     thinned = jaxgran.CoolingCurve(
         curve.times[few], curve.temperature[few], temperature_error=curve.temperature_error[few]

@@ -19,6 +19,7 @@ import jax
 
 import jaxgran
 from jaxgran import plotting
+from jaxgran._utils.extras import import_extra
 from jaxgran.cli.options import FitOptions, models_by_name, parse_settings
 from jaxgran.cli.output import as_json, check_new, list_written, title_of
 from jaxgran.cli.page import (
@@ -30,9 +31,8 @@ from jaxgran.cli.page import (
     write_page,
 )
 from jaxgran.cli.scene import has_dissipation
-from jaxgran.data.curve import import_extra
 from jaxgran.data.drop_test import DropTest
-from jaxgran.data.header import absent_of_header
+from jaxgran.data.measurement_header import absent_of_header
 from jaxgran.fitting.goodness import SIGNIFICANCE
 from jaxgran.fitting.report import parameter_rows, report
 from jaxgran.fitting.result import NOT_DETERMINED

@@ -25,9 +25,10 @@ from jaxgran.cli.options import (
 )
 from jaxgran.cli.output import check_new, list_written
 from jaxgran.cli.scene import read_scene
-from jaxgran.data.curve_file import ARCHIVE_SUFFIX, CSV_SUFFIXES
+from jaxgran.data.curve_archive import ARCHIVE_SUFFIX
+from jaxgran.data.curve_file import CSV_SUFFIXES
 from jaxgran.data.files import check_writable
-from jaxgran.data.tracks import TRACK_KEYS
+from jaxgran.data.header_keys import TRACK_KEYS
 from jaxgran.models.checks import check_volume
 from jaxgran.models.choose import NUM_PARTICLES, default_models
 

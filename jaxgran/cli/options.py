@@ -9,8 +9,9 @@ from cyclopts import Parameter, Token
 
 from jaxgran._utils.validation import POSITIVE
 from jaxgran.data.files import name_in_errors
-from jaxgran.data.header import OPTIONAL_KEYS, PRIOR_KEYS
-from jaxgran.data.tables import UNIT_KEYS, header_in_si
+from jaxgran.data.header_keys import OPTIONAL_KEYS, PRIOR_KEYS
+from jaxgran.data.header_lines import header_in_si
+from jaxgran.data.units import UNIT_KEYS
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.parameters import BY_SYMBOL
 

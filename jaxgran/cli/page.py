@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from jaxgran.data.curve import import_extra
+from jaxgran._utils.extras import import_extra
 from jaxgran.data.files import write_atomically
 from jaxgran.fitting.plan import Plan
 from jaxgran.fitting.report import (

@@ -10,14 +10,14 @@ import numpy as np
 
 import jaxgran
 from jaxgran import plotting
+from jaxgran._utils.extras import import_extra
 from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.cli.options import parse_settings
 from jaxgran.cli.output import as_json, check_new, list_written, title_of
 from jaxgran.cli.page import command_of, question_of, sections_of_plan, write_page
 from jaxgran.cli.scene import has_dissipation, read_toml
-from jaxgran.data.curve import import_extra
 from jaxgran.data.files import check_writable, name_in_errors, write_atomically
-from jaxgran.data.measurement_file import arguments_of_header
+from jaxgran.data.measurement_header import arguments_of_header
 from jaxgran.data.scene_file import errors_of, times_of
 from jaxgran.fitting.twins import twin
 

@@ -9,8 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 import jaxgran
-from jaxgran.data.files import header_count, header_number, name_in_errors
-from jaxgran.data.header import gas_of_header, guesses_of_header
+from jaxgran.data.files import name_in_errors
+from jaxgran.data.header import gas_of_header
+from jaxgran.data.header_values import header_count, header_number
+from jaxgran.data.measurement_header import guesses_of_header
 from jaxgran.data.scene_file import read_scene_file
 from jaxgran.scene.elements import container_volume_ratio
 from jaxgran.scene.parameters import symbol_of

@@ -39,7 +39,6 @@ MAX_LISTED_VALUES = 4
 LIBRARIES = ("jaxgran.", "equinox.", "builtins.", "typing.", "abc.", "collections.")
 """Beginnings of names of classes and functions that the versions of packages describe."""
 
-
 _TERMINATED = threading.Event()
 """Set by SIGTERM during a run that writes checkpoints."""
 

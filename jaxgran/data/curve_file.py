@@ -1,16 +1,12 @@
 """Files of cooling curves and drop tests.
 
 A CSV file holds a measured curve, tracks of particles or a drop test, under header lines that
-describe the gas; an npz file holds every array of a curve. `jaxgran.data.tables` reads the tables,
-and `jaxgran.data.tracks` trajectories.
+describe the gas; an npz file holds every array of a curve, and a trajectory the velocities of
+particles.
 """
 
-import io
-import json
 import warnings
-import zipfile
-import zlib
-from math import prod
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,21 +14,24 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxgran._utils.validation import check_bool
-from jaxgran.data import files, tracks
-from jaxgran.data.curve import QUANTITIES, CoolingCurve, check_values, from_arrays, to_arrays
-from jaxgran.data.definitions import BY_COLUMN, TEMPERATURE_COLUMNS
+from jaxgran.data import files
+from jaxgran.data.curve import CoolingCurve, from_arrays
+from jaxgran.data.curve_archive import ARCHIVE_SUFFIX, read_archive, write_archive
+from jaxgran.data.curve_checks import check_values
+from jaxgran.data.curve_questions import ask_about_columns
+from jaxgran.data.definitions import BY_COLUMN, TEMPERATURE_COLUMNS, facts_of
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.drop_test_file import drop_test_columns, drop_test_of_table, is_drop_test
 from jaxgran.data.header import checked_header, gas_or_none, missing_keys
-from jaxgran.data.questions import ask_about_columns, ask_about_speeds, scene_of
-from jaxgran.data.tables import (
-    UNIT_KEYS,
-    Table,
-    header_entry,
-    header_in_si,
-    read_table,
-    text_of_comment,
-)
+from jaxgran.data.header_lines import header_entry, header_in_si, text_of_comment
+from jaxgran.data.quantities import QUANTITIES
+from jaxgran.data.questions import ask
+from jaxgran.data.tables import Table, read_table
+from jaxgran.data.track_positions import IDENTITIES, track_columns
+from jaxgran.data.tracks import curve_of_tracks
+from jaxgran.data.trajectory_curve import curve_of_trajectory, is_trajectory
+from jaxgran.data.units import UNIT_KEYS
+from jaxgran.data.usual_values import ask_about_speeds
 
 WANTED = "t,T[,T_err][,msd][,msd_err]"
 """Columns of a file, for messages."""
@@ -46,14 +45,8 @@ ANY_MATERIAL = {"density": "1", "Y": "1", "nu": "0", "T0": "1"}
 FIELDS = {quantity.column: name for name, quantity in QUANTITIES.items()}
 """Fields of a curve by column."""
 
-ARCHIVE_SUFFIX = ".npz"
-"""Suffix of files that hold every array of a curve."""
-
 CSV_SUFFIXES = (".csv", ".txt", ".dat", "")
 """Suffixes with which a curve is written as text."""
-
-HEADER_ENTRY = "header"
-"""Entry of an npz file that holds the header, as JSON; all others are arrays."""
 
 
 def read_curve(
@@ -114,44 +107,57 @@ def read_data(path: Path, given: dict[str, str]) -> Content:
         given: further entries of its header.
     """
     if path.suffix == ARCHIVE_SUFFIX:
-        curve, header = _read_archive(path)
-        header = header_in_si(header) | header_in_si(given)
-        return Content(curve, header, list(ask_about_columns(curve, header, gas_or_none(header))))
-    if tracks.is_trajectory(path):
+        curve, header = read_archive(path)
+        return _content_of_curve(curve, header_in_si(header) | header_in_si(given))
+    if is_trajectory(path):
         if units := UNIT_KEYS.keys() & given.keys():
             raise ValueError(
                 f"{', '.join(units)}: the units of a trajectory stand in the file itself (units or "
                 "ITEM: UNITS); write units behind the other values, as in {'diameter': '2 mm'}"
             )
-        curve, header = tracks.curve_of_trajectory(path, header_in_si(given))
-        return Content(curve, header, list(ask_about_columns(curve, header, gas_or_none(header))))
-    table = read_table(path, WANTED, _columns_to_read, given, tracks.IDENTITIES)
-    header = table.header
-    columns = table.columns
-    if is_drop_test(list(columns)):
+        return _content_of_curve(*curve_of_trajectory(path, header_in_si(given)))
+    table = read_table(path, WANTED, _columns_to_read, given, IDENTITIES)
+    if is_drop_test(list(table.columns)):
         test, questions = drop_test_of_table(table)
-        return Content(test, header, [*ask_about_speeds(columns), *questions])
-    if "x" in columns:
-        missing = missing_keys(header)
-        gas = gas_or_none(header | {k: x for k, x in ANY_MATERIAL.items() if k in missing})
-        curve, questions = tracks.curve_of_tracks(columns, header, table.lines, gas)
-        if table.num_left_out:
-            questions.append(f"{table.num_left_out} positions that belong to no track are left out")
-        questions += ask_about_columns(curve, header, gas_or_none(header))
-        return Content(curve, header, questions)
-    columns, rounding, column = _with_temperature(table, header)
-    arrays = {FIELDS[name]: jnp.asarray(x) for name, x in columns.items()}
-    check_values(arrays, place=lambda i: f"line {table.lines[i]}")
-    curve = from_arrays(arrays)
+        return Content(test, table.header, [*ask_about_speeds(table.columns), *questions])
+    if "x" in table.columns:
+        return _content_of_tracks(table)
+    return _content_of_table(table)
+
+
+def _content_of_curve(curve: CoolingCurve, header: dict[str, str]) -> Content:
+    questions = ask_about_columns(curve, header, gas_or_none(header))
+    return Content(curve, header, list(questions))
+
+
+def _content_of_tracks(table: Table) -> Content:
+    missing = missing_keys(table.header)
+    any_material = {key: x for key, x in ANY_MATERIAL.items() if key in missing}
+    gas = gas_or_none(table.header | any_material)
+    tracked = curve_of_tracks(table.columns, table.header, table.lines, gas)
+    content = _content_of_curve(tracked.curve, tracked.header)
+    questions = list(tracked.questions)
+    if table.num_left_out:
+        questions.append(ask("no track", number=table.num_left_out))
+    return content._replace(questions=questions + content.questions)
+
+
+def _content_of_table(table: Table) -> Content:
+    """Return the curve of a table of T, or of a quantity from which T follows."""
+    read = _read_temperature(table)
+    columns = {FIELDS[name]: jnp.asarray(x) for name, x in read.columns.items()}
+    check_values(columns, place=lambda i: f"line {table.lines[i]}")
+    curve = from_arrays(columns)
     curve.check_measured()
-    questions = list(ask_about_columns(curve, header, gas_or_none(header), rounding, column))
-    return Content(curve, header, questions, rounding)
+    gas = gas_or_none(read.header)
+    questions = ask_about_columns(curve, read.header, gas, read.rounding, read.column)
+    return Content(curve, read.header, list(questions), read.rounding)
 
 
 def _columns_to_read(names: list[str]) -> list[str]:
     """Return the columns; raise ValueError if one is unknown, missing or repeated."""
     if "x" in names or "id" in names:
-        return tracks.track_columns(names)
+        return track_columns(names)
     if is_drop_test(names):
         return drop_test_columns(names)
     temperatures = [name for name in ("T", *TEMPERATURE_COLUMNS) if name in names]
@@ -166,7 +172,8 @@ def _columns_to_read(names: list[str]) -> list[str]:
     if len(given := sorted((errors | {"T_err"}) & {*names})) > 1:
         raise ValueError(f"{' and '.join(given)} each give the error of T; keep one")
     if unknown or missing or len(set(names)) < len(names):
-        _, _, *measured = [q.column for q in QUANTITIES.values() if q.measured]  # without t and T
+        columns = [quantity.column for quantity in QUANTITIES.values() if quantity.measured]
+        measured = [name for name in columns if name not in ("t", "T")]
         raise ValueError(
             f"the columns are {', '.join(names)}; "
             + (f"missing: {', '.join(missing)}; " if missing else "")
@@ -178,26 +185,37 @@ def _columns_to_read(names: list[str]) -> list[str]:
     return names
 
 
-def _with_temperature(
-    table: Table, header: dict[str, str]
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], str]:
-    """Return columns with T = <v^2>/d in place of one of `TEMPERATURE_COLUMNS`.
+class _Temperature(NamedTuple):
+    """Columns of a curve with T = <v^2>/d.
 
-    The velocities are taken for isotropic and Maxwellian. The header gets the entry T_from,
-    and T_of if the column holds energies.
+    Attributes:
+        columns: by name, in SI.
+        header: of the file; if T was computed T_from says how, and T_of whether from energies.
+        rounding: last digits of T and T_rot as they were written, SI, by field.
+        column: from which T was read.
+    """
 
-    Returns:
-        The columns, the last digits of T and T_rot by field, and the column that gave T.
+    columns: dict[str, np.ndarray]
+    header: dict[str, str]
+    rounding: dict[str, np.ndarray]
+    column: str
+
+
+def _read_temperature(table: Table) -> _Temperature:
+    """Return the columns of a table, with T in place of one of `TEMPERATURE_COLUMNS`.
+
+    The velocities are taken for isotropic and Maxwellian.
 
     Raises:
         ValueError: for a speed that is not positive, or an energy of particles of unknown mass.
     """
     columns = dict(table.columns)
+    header = dict(table.header)
     written = [name for name in ("T", "T_rot") if name in columns]
     rounding = {FIELDS[name]: table.last_digits(name) for name in written}
     name = next((name for name in TEMPERATURE_COLUMNS if name in columns), "T")
     if name == "T":
-        return columns, rounding, name
+        return _Temperature(columns, header, rounding, name)
     values = columns.pop(name)
     error = columns.pop(f"{name}_err", None)
     definition = BY_COLUMN[name]
@@ -208,15 +226,15 @@ def _with_temperature(
             f"line {table.lines[i]}: {name} is {values[i]:g}, it must be a positive number; "
             "correct or remove this row"
         )
-    scene = scene_of(header)
-    if "energy" in name and np.isnan(scene.mass):
+    facts = facts_of(header)
+    if "energy" in name and np.isnan(facts.mass):
         raise ValueError(
             f"a column {name} needs the mass of a particle: add diameter and density to the "
             "header, or give T = <v^2>/d itself"
         )
-    if name == "total_energy" and np.isnan(scene.number):
+    if name == "total_energy" and np.isnan(facts.number):
         raise ValueError("a column of the energy of all particles needs N: add it to the header")
-    factor = definition.factor(scene)
+    factor = definition.factor(facts)
     columns["T"] = factor * values**power
     formula = name if power == 1 else f"{name}^{power}"
     header["T_from"] = f"T = {factor:.4g} {formula}: it is {definition.words}"
@@ -226,7 +244,7 @@ def _with_temperature(
     rounding["temperature"] = slope * table.last_digits(name)
     if error is not None:
         columns["T_err"] = slope * error
-    return columns, rounding, name
+    return _Temperature(columns, header, rounding, name)
 
 
 def write_curve(
@@ -267,65 +285,30 @@ def write_curve(
     if path.exists() and not overwrite:
         raise ValueError(f"{path} exists; choose another name or set overwrite=True")
     if path.suffix == ARCHIVE_SUFFIX:
-        arrays: dict[str, Any] = {name: np.asarray(x) for name, x in to_arrays(curve).items()}
-        arrays[HEADER_ENTRY] = np.array(json.dumps(header))
-        files.write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
+        write_archive(path, curve, header)
         return
     curve.check_single()
-    fields = {column: getattr(curve, field) for column, field in FIELDS.items()}
-    present = {column: np.asarray(x) for column, x in fields.items() if x is not None}
-    lines = []
+    text = "\n".join([*_header_lines(header), *_table_lines(curve)]) + "\n"
+    files.write_atomically(path, lambda f: f.write(text.encode()))
+
+
+def _header_lines(header: dict[str, str]) -> Iterator[str]:
+    """Yield the lines of a header; raise ValueError for one that would be read otherwise."""
     for key, value in header.items():
         line = f"# {key}: {value}"
-        if len(line.splitlines()) > 1 or header_entry(text_of_comment(line)) != (
-            key,
-            value.strip(),
-        ):
+        is_one = len(line.splitlines()) == 1
+        if not is_one or header_entry(text_of_comment(line)) != (key, value.strip()):
             raise ValueError(
                 f"header key {key!r}: key and value must be one line of text each, the key without "
                 f": and =, and the value must not end in #, a quote or a separator; got {value!r}"
             )
-        lines.append(line)
-    lines.append(",".join(present))
-    lines += [",".join(f"{x:.17g}" for x in row) for row in zip(*present.values(), strict=True)]
-    text = "\n".join(lines) + "\n"
-    files.write_atomically(path, lambda f: f.write(text.encode()))
+        yield line
 
 
-def _check_sizes(content: io.BytesIO) -> None:
-    """Raise ValueError for an array larger than its entry of an npz file, or too much in all."""
-    with zipfile.ZipFile(content) as archive:
-        if sum(entry.file_size for entry in archive.infolist()) > files.MAX_BYTES:
-            raise ValueError(f"more than {files.MAX_BYTES:g} bytes unpacked")
-        for entry in archive.infolist():
-            with archive.open(entry) as file:
-                version = np.lib.format.read_magic(file)
-                read = np.lib.format.read_array_header_1_0
-                read = read if version == (1, 0) else np.lib.format.read_array_header_2_0
-                shape, _, dtype = read(file)
-            if prod(shape) * dtype.itemsize > entry.file_size:
-                raise ValueError(f"{entry.filename} is shorter than its header says")
-
-
-def _read_archive(path: Path) -> tuple[CoolingCurve, dict[str, str]]:
-    content = io.BytesIO(files.read_bytes(path))
-    try:
-        _check_sizes(content)
-        content.seek(0)
-        with np.load(content, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        header = checked_header(json.loads(str(arrays.pop(HEADER_ENTRY))))
-        return from_arrays({name: jnp.asarray(x) for name, x in arrays.items()}), header
-    except (
-        OSError,
-        EOFError,
-        ValueError,
-        KeyError,
-        TypeError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ) as error:
-        raise ValueError(
-            f"not a file that this version of jaxgran.write_curve wrote ({error}); give such a "
-            "file, or a CSV file"
-        ) from None
+def _table_lines(curve: CoolingCurve) -> Iterator[str]:
+    """Yield the line of names and the rows of the known quantities of a curve."""
+    fields = {column: getattr(curve, field) for column, field in FIELDS.items()}
+    present = {column: np.asarray(x) for column, x in fields.items() if x is not None}
+    yield ",".join(present)
+    for row in zip(*present.values(), strict=True):
+        yield ",".join(f"{x:.17g}" for x in row)

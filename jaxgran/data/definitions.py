@@ -1,13 +1,16 @@
 """Definitions of temperature: what a column may hold in place of T = <v^2>/d, and the factors."""
 
 from collections.abc import Callable
-from math import pi
+from math import nan, pi
 from typing import NamedTuple
+
+from jaxgran.data.header_values import header_count, header_dimension, header_number
+from jaxgran.scene.geometry import sphere_mass
 
 BOLTZMANN = 1.380649e-23
 
 
-class Scene(NamedTuple):
+class GasFacts(NamedTuple):
     """What factors depend on.
 
     Attributes:
@@ -18,9 +21,9 @@ class Scene(NamedTuple):
     """
 
     d: int
-    mass: float = float("nan")
-    number: float = float("nan")
-    T0: float = float("nan")
+    mass: float = nan
+    number: float = nan
+    T0: float = nan
 
 
 class Definition(NamedTuple):
@@ -35,7 +38,7 @@ class Definition(NamedTuple):
 
     column: str
     words: str
-    factor: Callable[[Scene], float]
+    factor: Callable[[GasFacts], float]
     power: int = 1
 
 
@@ -88,13 +91,13 @@ MAX_DIFFERENCE = 0.12
 """Relative difference of a ratio from the one of a definition up to which it is named."""
 
 
-def other_definitions(ratio: float, column: str, scene: Scene) -> list[tuple[Definition, float]]:
+def other_definitions(ratio: float, column: str, facts: GasFacts) -> list[tuple[Definition, float]]:
     """Return the definitions that explain a ratio of T to its expected value, the nearest first.
 
     Args:
         ratio: T as it was read over the expected one.
         column: from which T was read.
-        scene: of the header.
+        facts: of the header.
 
     Returns:
         Each definition, and the factor by which T becomes right.
@@ -102,8 +105,24 @@ def other_definitions(ratio: float, column: str, scene: Scene) -> list[tuple[Def
     read = BY_COLUMN[column]
     found = []
     for other in DEFINITIONS:
-        factor = other.factor(scene) / read.factor(scene)
+        factor = other.factor(facts) / read.factor(facts)
         difference = abs(ratio * factor - 1)  # nan if something is not known
         if other.power == read.power and difference < MAX_DIFFERENCE and factor != 1:
             found.append((difference, other, factor))
     return [(other, factor) for _, other, factor in sorted(found, key=lambda x: x[0])]
+
+
+def facts_of(header: dict[str, str]) -> GasFacts:
+    """Return what a header says of the gas, on which the factors of definitions of T depend."""
+    spread = header_number({"diameter_sd": "0"} | header, "diameter_sd")
+    mass = nan
+    if {"diameter", "density"} <= header.keys():
+        size = header_number(header, "diameter")
+        sphere = float(sphere_mass(size, header_number(header, "density")))
+        mass = sphere * (1 + 3 * (spread / size) ** 2)  # the mean cube over the cube of the mean
+    return GasFacts(
+        d=header_dimension(header),
+        mass=mass,
+        number=header_count(header, "N") or nan,
+        T0=header_number({"T0": "0"} | header, "T0") or nan,
+    )

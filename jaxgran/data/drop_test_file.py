@@ -4,14 +4,15 @@ The names of the columns tell which kind of table it is.
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy  # which imports scipy.stats at its first use
 from jaxtyping import Float
 
 from jaxgran.data.drop_test import PARTNERS, DropTest
-from jaxgran.data.files import header_number
+from jaxgran.data.header_values import header_number
+from jaxgran.data.questions import ask
 from jaxgran.data.tables import Table
 
 RESTITUTION = ("eps", "eps_err")
@@ -23,7 +24,6 @@ NORMAL = ("nx", "ny", "nz")
 SPINS = ("wx", "wy", "wz")
 SPINS_AFTER = tuple(f"{name}_after" for name in SPINS)
 """Columns of velocities, unit vectors from the partner to the sphere, and angular velocities."""
-
 
 EPS_RANGE = (0.0, 1.2)
 """Allowed eps, and |eps_t|, of a file; beyond 1 it is also compared with its error."""
@@ -62,22 +62,27 @@ def drop_test_columns(names: list[str]) -> list[str]:
             "a column beta_t has the sign of the model: write eps_t = -beta_t, the tangential "
             "velocity of the surfaces after over that before an impact, or eps_t_center of centres"
         )
-    if not {*AFTER, *BEFORE}.isdisjoint(names):
-        wanted, further = _columns_of_velocities(names)
-    else:
-        wanted, further = _columns_of_restitution(names)
-    if sorted({*names} - {*further}) != sorted(wanted) or len({*names}) < len(names):
-        optional = f", and where known {', '.join(further)}" if further else ""
+    has_velocities = not {*AFTER, *BEFORE}.isdisjoint(names)
+    kind = _kind_with_velocities(names) if has_velocities else _kind_with_restitution(names)
+    is_complete = sorted({*names} - {*kind.optional}) == sorted(kind.required)
+    if not is_complete or len({*names}) < len(names):
+        optional = f", and where known {', '.join(kind.optional)}" if kind.optional else ""
         raise ValueError(
-            f"the columns are {', '.join(names)}; a drop test needs {','.join(wanted)}"
+            f"the columns are {', '.join(names)}; a drop test needs {','.join(kind.required)}"
             f"{optional}, each once. Oblique impacts have v_n,v_t or v,angle with eps_t,eps_t_err, "
             "or velocities before and after"
         )
     return names
 
 
-def _columns_of_restitution(names: list[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the columns that a table of restitution needs, and those that it may have."""
+class _Kind(NamedTuple):
+    """A kind of table, by its columns."""
+
+    required: tuple[str, ...]
+    optional: tuple[str, ...] = ()
+
+
+def _kind_with_restitution(names: list[str]) -> _Kind:
     both = {"eps_t", "eps_t_center"} & {*names}
     if len(both) > 1:
         raise ValueError(
@@ -86,19 +91,18 @@ def _columns_of_restitution(names: list[str]) -> tuple[tuple[str, ...], tuple[st
         )
     tangential = OF_CENTRES if "eps_t_center" in names else OF_SURFACES
     if not {"v_n", "v_t"}.isdisjoint(names):
-        return ("v_n", "v_t", *RESTITUTION, *tangential), ("v_n_err", "v_t_err")
+        return _Kind(("v_n", "v_t", *RESTITUTION, *tangential), ("v_n_err", "v_t_err"))
     if "angle" in names:
-        return ("v", "angle", *RESTITUTION, *tangential), ("v_err", "angle_err")
+        return _Kind(("v", "angle", *RESTITUTION, *tangential), ("v_err", "angle_err"))
     if both:
         raise ValueError(
             f"the columns have {both.pop()} without the tangential speed: give v_n,v_t, or v,angle "
             "with the angle from the normal in degrees"
         )
-    return ("v", *RESTITUTION), ("v_err",)
+    return _Kind(("v", *RESTITUTION), ("v_err",))
 
 
-def _columns_of_velocities(names: list[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the columns that a table of velocities needs, and those that it may have."""
+def _kind_with_velocities(names: list[str]) -> _Kind:
     if missing := [name for name in NORMAL if name not in names]:
         raise ValueError(
             f"the velocities have no normal ({', '.join(missing)}): add nx,ny,nz, the unit vector "
@@ -106,8 +110,8 @@ def _columns_of_velocities(names: list[str]) -> tuple[tuple[str, ...], tuple[str
         )
     wanted = (*NORMAL, *BEFORE, *AFTER, "v_err")
     if {*SPINS, *SPINS_AFTER}.isdisjoint(names):
-        return wanted, ()
-    return (*wanted, *SPINS, *SPINS_AFTER, "w_err"), ()
+        return _Kind(wanted)
+    return _Kind((*wanted, *SPINS, *SPINS_AFTER, "w_err"))
 
 
 def drop_test_of_table(table: Table) -> tuple[DropTest, list[str]]:
@@ -219,45 +223,23 @@ def _ask_about_sign(name: str, value: np.ndarray, obliqueness: np.ndarray) -> li
     trend = scipy.stats.kendalltau(obliqueness, value, alternative="less")
     if not trend.pvalue < SIGN_LEVEL:
         return []
-    return [
-        f"{name} falls as impacts become more grazing, and Coulomb's law makes it rise to 1: is it "
-        f"beta_t = -{name}? Then change its sign"
-    ]
+    return [ask("sign of eps_t", name=name)]
 
 
 def _of_velocities(table: Table, onto: str) -> DropTest:
     """Return the drop test of velocities before and after impacts: see `drop_test_of_table`."""
     columns = table.columns
-
-    def vectors(names: tuple[str, ...]) -> Float[np.ndarray, "n 3"]:
-        return np.stack([columns[name] for name in names], axis=1)
-
-    normal = vectors(NORMAL)
-    length = np.linalg.norm(normal, axis=1)
-    if np.any(wrong := np.abs(length - 1) > MAX_TILT):
-        i = int(np.argmax(wrong))
-        raise ValueError(
-            f"line {table.lines[i]}: the normal nx,ny,nz has the length {length[i]:g}; give a unit "
-            "vector"
-        )
-    normal = normal / length[:, None]
-    before = vectors(BEFORE)
-    after = vectors(AFTER)
+    normal = _normals(table)
+    before = _vectors(table, BEFORE)
+    after = _vectors(table, AFTER)
     error = columns["v_err"]
     error_of_surface = error
     has_spins = "wx" in columns
     if has_spins:
-        for name in (*SPINS, *SPINS_AFTER, "w_err"):
-            if table.units[name] in AMBIGUOUS_UNITS:
-                raise ValueError(
-                    f"column {name} is an angular velocity without a unit that says whether it is "
-                    f"in radians or revolutions: write {name} (rad/s), (deg/s), (turn/s) or (rpm)"
-                )
-        if "diameter" not in table.header:
-            raise ValueError("spins need the diameter of the spheres: add it to the header")
+        _check_spins(table)
         radius = header_number(table.header, "diameter") / 2
-        before = before - radius * np.cross(vectors(SPINS), normal)
-        after = after - radius * np.cross(vectors(SPINS_AFTER), normal)
+        before = before - radius * np.cross(_vectors(table, SPINS), normal)
+        after = after - radius * np.cross(_vectors(table, SPINS_AFTER), normal)
         error_of_surface = np.hypot(error, radius * columns["w_err"])
     elif table.header.get(SPIN_BEFORE) != "0":
         raise ValueError(
@@ -275,17 +257,46 @@ def _of_velocities(table: Table, onto: str) -> DropTest:
         )
     sideways = before + speed[:, None] * normal
     tangential = np.linalg.norm(sideways, axis=1)
-    direction = sideways / np.where(tangential > 0, tangential, 1.0)[:, None]
-    eps_t = np.sum(after * direction, axis=1) / np.where(tangential > 0, tangential, 1.0)
+    denominator = np.where(tangential > 0, tangential, 1.0)
+    direction = sideways / denominator[:, None]
     return DropTest(
-        speed,
-        speed_after / speed,
-        error / speed,
-        onto,
-        tangential,
-        eps_t,
-        error_of_surface / np.where(tangential > 0, tangential, 1.0),
+        speed=speed,
+        restitution=speed_after / speed,
+        error=error / speed,
+        onto=onto,
+        tangential_speed=tangential,
+        tangential_restitution=np.sum(after * direction, axis=1) / denominator,
+        tangential_error=error_of_surface / denominator,
         of_centres=not has_spins,
         speed_error=error,
         tangential_speed_error=error_of_surface,
     )
+
+
+def _vectors(table: Table, names: tuple[str, ...]) -> Float[np.ndarray, "n 3"]:
+    return np.stack([table.columns[name] for name in names], axis=1)
+
+
+def _normals(table: Table) -> Float[np.ndarray, "n 3"]:
+    """Return the unit vectors from the partner to the sphere; raise ValueError for others."""
+    normal = _vectors(table, NORMAL)
+    length = np.linalg.norm(normal, axis=1)
+    if np.any(wrong := np.abs(length - 1) > MAX_TILT):
+        i = int(np.argmax(wrong))
+        raise ValueError(
+            f"line {table.lines[i]}: the normal nx,ny,nz has the length {length[i]:g}; give a unit "
+            "vector"
+        )
+    return normal / length[:, None]
+
+
+def _check_spins(table: Table) -> None:
+    """Raise ValueError for spins that lack a unit, or the diameter of the spheres."""
+    for name in (*SPINS, *SPINS_AFTER, "w_err"):
+        if table.units[name] in AMBIGUOUS_UNITS:
+            raise ValueError(
+                f"column {name} is an angular velocity without a unit that says whether it is "
+                f"in radians or revolutions: write {name} (rad/s), (deg/s), (turn/s) or (rpm)"
+            )
+    if "diameter" not in table.header:
+        raise ValueError("spins need the diameter of the spheres: add it to the header")

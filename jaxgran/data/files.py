@@ -1,4 +1,4 @@
-"""Reading and atomic writing of files, and numbers of the header of a curve."""
+"""Reading and atomic writing of files."""
 
 import errno
 import gzip
@@ -6,12 +6,13 @@ import os
 import shutil
 import uuid
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+MAX_BYTES = 2**30
+"""Largest size of a file, unpacked."""
 
 
 def checked_path(path: Any, kind: str) -> Path:
@@ -38,10 +39,6 @@ def name_in_errors(path: Path) -> Iterator[None]:
         raise ValueError(f"{path}: not a text file; GSD files end in .gsd") from None
     except (ValueError, OSError, RuntimeError) as error:
         raise ValueError(f"{path}: {error}") from None
-
-
-MAX_BYTES = 2**30
-"""Largest size of a file, unpacked."""
 
 
 def read_bytes(path: Path) -> bytes:
@@ -110,51 +107,3 @@ def check_writable(path: str | Path) -> None:
     else:
         return
     raise OSError(code, f"cannot write ({os.strerror(code)}); name another file", str(path))
-
-
-MAX_COUNT = 10**12
-"""Largest whole number in a header."""
-
-
-def header_number(header: Mapping[str, Any], key: str) -> float:
-    """Return the value of a key in the header of a curve, as a number.
-
-    Raises:
-        ValueError: if the value is not a finite number.
-        KeyError: if there is no such key.
-    """
-    try:
-        number = float("nan") if "_" in str(header[key]) else float(header[key])
-    except (TypeError, ValueError):
-        number = float("nan")
-    if not np.isfinite(number):
-        raise ValueError(f"header line {key}: {header[key]!r} is not a finite number")
-    return number
-
-
-def positive_number(header: Mapping[str, Any], key: str) -> float:
-    """Return the value of a key that must be a positive number: see `header_number`."""
-    number = header_number(header, key)
-    if number <= 0:
-        raise ValueError(f"header line {key}: must be a positive number, got {header[key]!r}")
-    return number
-
-
-def header_count(header: dict[str, str], key: str) -> int | None:
-    """Return the value of a key in the header of a curve, such as N, as a positive whole number.
-
-    Returns:
-        The number, or None if there is no such key.
-
-    Raises:
-        ValueError: if the value is not a positive whole number.
-    """
-    if key not in header:
-        return None
-    number = header_number(header, key)
-    if not (1 <= number <= MAX_COUNT and number.is_integer()):
-        raise ValueError(
-            f"header line {key}: must be a whole number from 1 to {MAX_COUNT:g}, got "
-            f"{header[key]!r}"
-        )
-    return int(number)

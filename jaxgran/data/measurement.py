@@ -18,9 +18,10 @@ from jaxgran._utils.validation import (
     checked_int,
     float_array,
 )
-from jaxgran.data.curve import QUANTITIES, CoolingCurve
+from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.drop_test import DropTest
-from jaxgran.data.header import ABSENT
+from jaxgran.data.header_keys import ABSENT
+from jaxgran.data.quantities import QUANTITIES
 from jaxgran.scene.gas import Gas
 
 START_TIME = "t0"

@@ -8,17 +8,14 @@ from jaxgran.data import files
 from jaxgran.data.curve_file import CSV_FILE, read_data
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.header import (
-    ANY_GAS,
-    absent_of_header,
     ask_about_another_gas,
     checked_header,
     gas_of_header,
-    guesses_of_header,
-    header_choice,
     missing_keys,
-    priors_of_header,
 )
+from jaxgran.data.header_keys import ANY_GAS
 from jaxgran.data.measurement import Measurement
+from jaxgran.data.measurement_header import arguments_of_header
 from jaxgran.scene.gas import Gas
 
 
@@ -54,10 +51,10 @@ def read_measurement(
             `write_curve` writes are read, too.
         header: further entries of the header, before anything is read; they replace
             entries with the same key. Keys: see `jaxgran.data.header.gas_of_header` and
-            `priors_of_header`, N, replicas, absent, tracked, T0_of ("run" or "ensemble"),
-            T_scale_err, errors ("measured"), which stand for the arguments of `Measurement`, those
-            of drop tests, onto ("sphere", "plate" or "wall"), eps_scatters ("yes") and spin_before
-            ("0"), and the keys of tracks.
+            `jaxgran.data.measurement_header.priors_of_header`, N, replicas, absent, tracked,
+            T0_of ("run" or "ensemble"), T_scale_err, errors ("measured"), which stand for the
+            arguments of `Measurement`, those of drop tests, onto ("sphere", "plate" or "wall"),
+            eps_scatters ("yes") and spin_before ("0"), and the keys of tracks.
         gas: the gas in place of the header's, such as the gas of a curve for a drop test.
 
     Returns:
@@ -96,24 +93,3 @@ def read_measurement(
     for question in questions:
         warnings.warn(f"{path}: {question}", stacklevel=2)
     return measurement
-
-
-def arguments_of_header(header: dict[str, str]) -> dict[str, Any]:
-    """Return the arguments of `Measurement` that a header gives, but for the gas.
-
-    Raises:
-        ValueError: for a value that is not allowed.
-    """
-    return {
-        "num_particles": files.header_count(header, "N"),
-        "replicas": files.header_count(header, "replicas") or 1,
-        "priors": priors_of_header(header),
-        "absent": absent_of_header(header),
-        "tracked": files.header_count(header, "tracked"),
-        "ensemble_start": header_choice(header, "T0_of", ("run", "ensemble")) == "ensemble",
-        "calibration_error": files.header_number({"T_scale_err": "0"} | header, "T_scale_err"),
-        "errors_measured": header_choice(header, "errors", ("any", "measured")) == "measured",
-        "of_energy": header_choice(header, "T_of", ("velocity", "energy")) == "energy",
-        "guesses": guesses_of_header(header),
-        "header": tuple(header.items()),
-    }

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxgran.data import files, tracks
+from jaxgran.data.header_values import positive_number
+from jaxgran.data.track_positions import positions_of_tracks
 
 NORMAL_MAD = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
@@ -63,11 +64,11 @@ class Motion:
         """Return the motion in a file of tracks.
 
         Args:
-            columns: columns of `tracks.track_columns`, in SI.
+            columns: columns of `track_positions.track_columns`, in SI.
             header: header of the file, in SI.
             lines: line number of each row, for errors.
         """
-        ids, time, position = tracks.positions_of_tracks(columns, header, lines)
+        ids, time, position = positions_of_tracks(columns, header, lines)
         _, particle = np.unique(ids, return_inverse=True)
         times, frame = np.unique(time, return_inverse=True)
         order = np.lexsort((frame, particle))
@@ -75,7 +76,7 @@ class Motion:
         position = position[order]
         side = np.inf
         if "box_side" in header:
-            side = files.positive_number(header, "box_side")
+            side = positive_number(header, "box_side")
             position = _unwrapped(particle, position, side)
         return cls(particle, frame[order], position, times, side)
 

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from jaxgran._utils.validation import POSITIVE, Domain, checked_float, checked_int, checked_times
-from jaxgran.data.tables import header_in_si, read_text
+from jaxgran.data.header_lines import header_in_si
+from jaxgran.data.tables import read_text
 
 EXPERIMENT = "experiment"
 """Name of the table of a planned experiment."""

@@ -14,16 +14,21 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxgran._utils.formatting import text_table
-from jaxgran.data import files, tracks
+from jaxgran.data import files
 from jaxgran.data.contacts import Contacts, find_contacts
 from jaxgran.data.curve_file import CSV_FILE
 from jaxgran.data.drop_test import MAX_SIGMAS, SPHERE, WALL, DropTest
 from jaxgran.data.encounters import Encounters, find_encounters
 from jaxgran.data.flights import MIN_FRAMES, Breaks, error_by_scatter, flights_between
-from jaxgran.data.header import checked_header, gas_of_header, priors_of_header
+from jaxgran.data.header import checked_header, gas_of_header
+from jaxgran.data.header_lines import header_in_si
+from jaxgran.data.header_values import header_number
 from jaxgran.data.measurement import Measurement
+from jaxgran.data.measurement_header import priors_of_header
 from jaxgran.data.motion import Motion, error_by_second_differences
-from jaxgran.data.tables import header_in_si, read_table
+from jaxgran.data.tables import read_table
+from jaxgran.data.track_positions import IDENTITIES, track_columns
+from jaxgran.data.trajectory_curve import is_trajectory
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.parameters import MATERIAL, PARAMETERS
 
@@ -139,12 +144,12 @@ def read_impacts(path: str | Path, header: dict[str, Any] | None = None) -> Impa
     path = files.checked_path(path, CSV_FILE)
     given = {} if header is None else checked_header(header)
     with files.name_in_errors(path):
-        if tracks.is_trajectory(path) or path.suffix == ".npz":
+        if is_trajectory(path) or path.suffix == ".npz":
             raise ValueError(
                 "impacts are read from CSV files of tracks (id,t,x,y,z), frame by frame; a file of "
                 "velocities at few times does not show them"
             )
-        table = read_table(path, "id,t,x,y,z", tracks.track_columns, given, tracks.IDENTITIES)
+        table = read_table(path, "id,t,x,y,z", track_columns, given, IDENTITIES)
         entries = header_in_si(table.header)
         gas, questions = gas_of_header(entries)
         impacts = impacts_of_tracks(table.columns, entries, table.lines, gas)
@@ -159,7 +164,7 @@ def impacts_of_tracks(
     """Return the impacts that positions in frames show: see `read_impacts`.
 
     Args:
-        columns: columns of `tracks.track_columns`, in SI; rows in any order.
+        columns: columns of `track_positions.track_columns`, in SI; rows in any order.
         header: header of the file, in SI.
         lines: line number of each row, for errors.
         gas: gas with the diameter of the spheres and, if there are walls, a container.
@@ -203,7 +208,7 @@ def _given_error(header: dict[str, str]) -> float | None:
     """Return the localisation error of a header, m; None without one."""
     if "localisation_error" not in header:
         return None
-    error = files.header_number(header, "localisation_error")
+    error = header_number(header, "localisation_error")
     if not error > 0:
         raise ValueError(
             f"localisation_error must be > 0 m, got {error:g}. Leave it out, and it is estimated "

@@ -1,12 +1,13 @@
 """Fits of the parameters of a gas to measured cooling curves.
 
 - `fit`: the public function `fit`, the checks of its arguments and warnings.
-- `setup`: what a user asks for, as a `problem` with a first guess: `rows` are the measured values,
-  `parameters` the unknowns on an unconstrained scale.
+- `setup`: what a user asks for, as a `problem` with a first guess (`guesses`): `rows` are the
+  measured values, which `measured_rows` makes of a measurement, `parameters` the unknowns on an
+  unconstrained scale, `priors` what is known of them.
 - `prediction`, `comparison`, `innovations`: a curve by a model with its derivatives, and its
   independent residuals; `likelihood`: the public function of the gas.
-- `search`: the maximum of the likelihood; `simulations`: the same for stochastic models, and
-  `simulated_fit` its result.
+- `search`: the maximum of the likelihood; `simulations`: the same for stochastic models,
+  `simulated_errors` the errors of its estimate, and `simulated_fit` its result.
 - `estimate`, `result`: the estimate with its errors by cause (`information`), and `Fit`.
 - `goodness`, `outliers`: tests of the fit, and far values.
 - `alternatives`: alternative explanations of a curve, and the range of the parameters over them;

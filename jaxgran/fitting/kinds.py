@@ -72,7 +72,7 @@ DECLARABLE = {
     "drag": Declarable("drag_rate", "gamma"),
     "friction": Declarable("friction", "friction"),
 }
-"""The effects `jaxgran.data.header.ABSENT`."""
+"""The effects `jaxgran.data.header_keys.ABSENT`."""
 
 WALLS_ADDED = "walls that dissipate energy"
 DRAG_ADDED = "linear drag, as in air"

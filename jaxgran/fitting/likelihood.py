@@ -18,8 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxgran.data.curve import DEFAULTS, CoolingCurve
+from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.measurement import START_TIME, Measurement
+from jaxgran.data.run_options import DEFAULTS
+from jaxgran.fitting.guesses import guess_from_data
 from jaxgran.fitting.innovations import (
     Filtered,
     Nodes,
@@ -28,7 +30,6 @@ from jaxgran.fitting.innovations import (
     log_ratio,
 )
 from jaxgran.fitting.measured_rows import curve_rows, with_rate_error
-from jaxgran.fitting.parameters import guess_from_data
 from jaxgran.fitting.prediction import COMMON_FACTORS
 from jaxgran.fitting.rows import CurveRows, Observed
 from jaxgran.fitting.time_grid import TimeGrid, time_grid

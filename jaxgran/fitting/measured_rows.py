@@ -1,7 +1,7 @@
 """How a measured curve becomes rows of a fit: values that count, and what makes them scatter."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from jaxgran.fitting.rows import (
     CurveRows,
     Displacement,
     Grains,
+    RateError,
     rounding_errors,
 )
 from jaxgran.fitting.time_grid import time_grid
@@ -60,8 +61,8 @@ def curve_rows(
     errors, notes = errors_that_count(measurement)
     displacement = None
     if not fits_t0:
-        displacement, of_displacement = _displacement(measurement, model)
-        notes += of_displacement
+        displacement, notes_on_displacement = _displacement(measurement, model)
+        notes = notes + notes_on_displacement
     accuracy = float(model.rotation_accuracy(gas)) if _has_rotation(measurement) else 0.0
     rows = CurveRows(
         label=label,
@@ -73,11 +74,123 @@ def curve_rows(
         grains=_grains(measurement, fits_T_0),
         faster=_finite_size_factor(measurement),
         unit_time=float(scales_at(gas).mean_free_time),
-        rate_error=(np.zeros(1), np.zeros(1)),
+        rate_error=RateError(np.zeros(1), np.zeros(1)),
         rotation_accuracy=accuracy,
         displacement=displacement,
     )
     return rows, notes
+
+
+def with_rate_error(rows: CurveRows, model: AbstractModel, gas: Gas) -> CurveRows:
+    """Return a curve with the error of a model's cooling rate in a gas.
+
+    Args:
+        rows: the measured curve.
+        model: of the fit; kinetic theory gives the curve on which the error of a stochastic one
+            depends.
+        gas: the scene, with values of the unknowns.
+    """
+    known = np.asarray(rows.curve.times) * rows.faster
+    times = time_grid(known, rows.unit_time).times
+    exact = KineticTheory() if model.stochastic else model
+    curve = curve_of_program(exact, gas, times, rows.displacement is not None)
+    if not np.all(np.isfinite(np.asarray(curve.temperature))):
+        return rows
+    error_model = error_model_of_curve(gas, curve, rows.measurement.num_particles)
+    error = np.broadcast_to(model.rate_error(error_model), times.shape)
+    return replace(rows, rate_error=RateError(times, np.asarray(error, float)))
+
+
+def with_errors_that_count(measurement: Measurement) -> Measurement:
+    """Return a measurement whose errors are those that a fit counts, as errors of measurement."""
+    exact = replace(measurement, rounding={})
+    errors = errors_that_count(exact).errors
+    fields: dict[str, Any] = {}
+    for column, name in enumerate(("temperature_error", "rotational_temperature_error")):
+        known = getattr(measurement.curve, name) is not None and np.any(errors[:, column] > 0)
+        fields[name] = jnp.asarray(errors[:, column]) if known else None
+    if measurement.curve.displacement is not None:
+        error = _displacement_errors(measurement).errors
+        fields["displacement_error"] = jnp.asarray(error) if np.any(error > 0) else None
+    data = replace(measurement.curve, **fields)
+    return replace(measurement, data=data, errors_measured=True)
+
+
+class CountedErrors(NamedTuple):
+    """Standard errors that a fit counts.
+
+    Attributes:
+        errors: 0 where a value has none that counts.
+        notes: on errors that do not count.
+    """
+
+    errors: np.ndarray
+    notes: list[str]
+
+
+def errors_that_count(measurement: Measurement) -> CountedErrors:
+    """Return the errors of T and T_rot, with the rounding of the file, shape (times, 2)."""
+    values = _values(measurement)
+    dimension = measurement.gas.dimension
+    given = measurement.curve.temperature_error
+    of_T = _errors_of_measurement("T_err", measurement, given, values[:, 0], dimension)
+    given = measurement.curve.rotational_temperature_error if _has_rotation(measurement) else None
+    spins = NUM_SPIN_COMPONENTS[dimension]
+    of_rotation = _errors_of_measurement("T_rot_err", measurement, given, values[:, 1], spins)
+    both = np.stack([of_T.errors, of_rotation.errors], axis=1)
+    notes = of_T.notes + of_rotation.notes
+    return CountedErrors(np.hypot(both, rounding_errors(measurement)), notes)
+
+
+def _errors_of_measurement(
+    name: str,
+    measurement: Measurement,
+    given: Any,
+    values: np.ndarray,
+    components: int,
+) -> CountedErrors:
+    """Return the standard errors of a measured quantity apart from the fluctuations of N grains.
+
+    The errors of a mean over runs come from the grains, and the likelihood knows them. So do
+    errors of one run that equal ``sqrt(2/(d N))`` of the values, the fluctuation of independent
+    samples of N grains. The errors of a sample of the grains are computed, too.
+
+    Args:
+        name: of the column of errors, for notes.
+        measurement: of a curve.
+        given: errors of the curve, or None.
+        values: to which they belong.
+        components: of a velocity, in the mean square of which the grains fluctuate.
+    """
+    nothing = np.zeros_like(values)
+    if given is None:
+        return CountedErrors(nothing, [])
+    error = np.asarray(given)
+    if measurement.errors_measured:
+        return CountedErrors(error, [])
+    N = measurement.num_particles
+    if measurement.replicas > 1:
+        note = (
+            f"{name} is not used: the scatter of the grains of {measurement.replicas} runs is "
+            "known. If these are errors of the measurement, say so: `errors: measured`"
+        )
+    elif measurement.tracked is not None:
+        note = f"{name} is not used: the sampling of {measurement.tracked} grains is known"
+    elif N is not None and _equals_fluctuation(error, values, components * N):
+        note = (
+            f"{name} equals the fluctuation of independent samples of {N} grains and is not "
+            "used: values of one run are correlated, and energies fluctuate less. If these "
+            "are errors of the measurement, say so: `errors: measured`"
+        )
+    else:
+        return CountedErrors(error, [])
+    return CountedErrors(nothing, [note])
+
+
+def _equals_fluctuation(error: np.ndarray, values: np.ndarray, number: int) -> bool:
+    """Return whether errors are the fluctuation of a mean square of independent components."""
+    ratio = error[error > 0] / (2 / number) ** 0.5 / values[error > 0]
+    return bool(ratio.size and np.all(np.abs(ratio - 1) < ERRORS_OF_PARTICLES))
 
 
 def _has_rotation(measurement: Measurement) -> bool:
@@ -92,41 +205,6 @@ def _values(measurement: Measurement) -> Float[np.ndarray, "times 2"]:
     if _has_rotation(measurement):
         T_rot = np.asarray(measurement.curve.rotational_temperature)
     return np.stack([T, T_rot], axis=1)
-
-
-def errors_that_count(
-    measurement: Measurement,
-) -> tuple[Float[np.ndarray, "times 2"], list[str]]:
-    """Return the standard errors of T and T_rot that a fit counts, and notes on the others.
-
-    They include the rounding of the file; 0 where a value has no error.
-    """
-    values = _values(measurement)
-    dimension = measurement.gas.dimension
-    notes: list[str] = []
-    given = measurement.curve.temperature_error
-    of_T = _errors_of_measurement("T_err", measurement, given, values[:, 0], dimension, notes)
-    given = measurement.curve.rotational_temperature_error if _has_rotation(measurement) else None
-    spins = NUM_SPIN_COMPONENTS[dimension]
-    of_rotation = _errors_of_measurement(
-        "T_rot_err", measurement, given, values[:, 1], spins, notes
-    )
-    return np.hypot(np.stack([of_T, of_rotation], axis=1), rounding_errors(measurement)), notes
-
-
-def with_errors_that_count(measurement: Measurement) -> Measurement:
-    """Return a measurement whose errors are those that a fit counts, as errors of measurement."""
-    exact = replace(measurement, rounding={})
-    errors, _ = errors_that_count(exact)
-    fields: dict[str, Any] = {}
-    for column, name in enumerate(("temperature_error", "rotational_temperature_error")):
-        known = getattr(measurement.curve, name) is not None and np.any(errors[:, column] > 0)
-        fields[name] = jnp.asarray(errors[:, column]) if known else None
-    if measurement.curve.displacement is not None:
-        error = _displacement_errors(measurement, [])
-        fields["displacement_error"] = jnp.asarray(error) if np.any(error > 0) else None
-    data = replace(measurement.curve, **fields)
-    return replace(measurement, data=data, errors_measured=True)
 
 
 def _used(
@@ -178,46 +256,22 @@ def _finite_size_factor(measurement: Measurement) -> float:
     return 1.0 if N is None else float(finite_size_cooling_factor(measurement.gas, float_array(N)))
 
 
-def _errors_of_measurement(
-    name: str,
-    measurement: Measurement,
-    given: Any,
-    values: np.ndarray,
-    components: int,
-    notes: list[str],
-) -> np.ndarray:
-    """Return the standard errors of a measured quantity apart from the fluctuations of N grains.
+@eqx.filter_jit
+def finite_size_cooling_factor(gas: Gas, num_particles: ArrayLike) -> Float[Array, ""]:
+    """Factor by which N particles without total momentum cool faster than many, at the same T.
 
-    The errors of a mean over runs come from the grains, and the likelihood knows them. So do
-    errors of one run that equal ``sqrt(2/(d N))`` of the values, the fluctuation of independent
-    samples of N grains. The errors of a sample of the grains are computed, too.
+    Their relative velocities have the temperature ``T' = T N/(N-1)``, and each particle
+    collides with N - 1 others: with ``-d ln T/dt = r(T)`` the factor is r(T')/r(T), here with the
+    loss ``1 - eps^2`` at the impact speed sqrt(2 T): 1 + .6/N for viscoelastic spheres, 1 + .5/N
+    for a constant eps. It is 1 between walls, which take up momentum.
     """
-    nothing = np.zeros_like(values)
-    if given is None:
-        return nothing
-    error = np.asarray(given)
-    if measurement.errors_measured:
-        return error
-    if measurement.replicas > 1:
-        notes.append(
-            f"{name} is not used: the scatter of the grains of {measurement.replicas} runs is "
-            "known. If these are errors of the measurement, say so: `errors: measured`"
-        )
-        return nothing
-    if measurement.tracked is not None:
-        notes.append(f"{name} is not used: the sampling of {measurement.tracked} grains is known")
-        return nothing
-    N = measurement.num_particles
-    if N is not None:
-        ratio = error[error > 0] / (2 / (components * N)) ** 0.5 / values[error > 0]
-        if ratio.size and np.all(np.abs(ratio - 1) < ERRORS_OF_PARTICLES):
-            notes.append(
-                f"{name} equals the fluctuation of independent samples of {N} grains and is not "
-                "used: values of one run are correlated, and energies fluctuate less. If these "
-                "are errors of the measurement, say so: `errors: measured`"
-            )
-            return nothing
-    return error
+    if gas.container is not None:
+        return jnp.ones_like(gas.temperature)
+    hotter = jnp.sqrt(num_particles / jnp.maximum(num_particles - 1, 1.0))
+    one = jnp.ones_like(gas.temperature)
+    loss = 1 - gas.reduced_law.restitution(one) ** 2
+    ratio = (1 - gas.reduced_law.restitution(hotter * one) ** 2) / jnp.where(loss > 0, loss, 1.0)
+    return hotter * jnp.where(loss > 0, ratio, 1.0)
 
 
 def _displacement(
@@ -228,17 +282,16 @@ def _displacement(
     ln <dr^2> is compared. If a value is below 0, as after noise was subtracted, only values more
     than `NOISE` errors above 0 count.
     """
-    notes: list[str] = []
     curve = measurement.curve
     gas = measurement.gas
     N = measurement.tracked or measurement.num_particles
     accuracy = model.displacement_accuracy(gas)
     is_known = curve.displacement_error is not None or N is not None
     if curve.displacement is None or accuracy is None or not is_known:
-        return None, notes
+        return None, []
     values = np.asarray(curve.displacement)
     given = curve.displacement_error
-    errors = _displacement_errors(measurement, notes)
+    errors, notes = _displacement_errors(measurement)
     is_measured = np.ones(values.shape, bool) if given is None else np.asarray(given) > 0
     of_grains = 0.0 if N is None else 2 / (gas.dimension * N * measurement.replicas)
     used = (values > 0) & is_measured
@@ -253,17 +306,16 @@ def _displacement(
     return Displacement(logs, whitening, float(accuracy)), notes
 
 
-def _displacement_errors(measurement: Measurement, notes: list[str]) -> Float[np.ndarray, "times"]:
-    """Return the standard errors of <dr^2> that a fit counts, and add notes on the others.
+def _displacement_errors(measurement: Measurement) -> CountedErrors:
+    """Return the standard errors of <dr^2>.
 
     Without a number of grains all count: the scatter of <dr^2> does not tell it.
     """
     values = np.asarray(measurement.curve.displacement)
     given = measurement.curve.displacement_error
     if given is not None and (measurement.tracked or measurement.num_particles) is None:
-        return np.asarray(given)
-    dimension = measurement.gas.dimension
-    return _errors_of_measurement("msd_err", measurement, given, values, dimension, notes)
+        return CountedErrors(np.asarray(given), [])
+    return _errors_of_measurement("msd_err", measurement, given, values, measurement.gas.dimension)
 
 
 def _correlation_of_walks(logs: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n n"]:
@@ -301,41 +353,3 @@ def unused_rotation(measurement: Measurement) -> str | None:
         "the measured T_rot is not used: the gas has no surface=jaxgran.Rough(...) (header key "
         "beta_t)"
     )
-
-
-@eqx.filter_jit
-def finite_size_cooling_factor(gas: Gas, num_particles: ArrayLike) -> Float[Array, ""]:
-    """Factor by which N particles without total momentum cool faster than many, at the same T.
-
-    Their relative velocities have the temperature ``T' = T N/(N-1)``, and each particle
-    collides with N - 1 others: with ``-d ln T/dt = r(T)`` the factor is r(T')/r(T), here with the
-    loss ``1 - eps^2`` at the impact speed sqrt(2 T): 1 + .6/N for viscoelastic spheres, 1 + .5/N
-    for a constant eps. It is 1 between walls, which take up momentum.
-    """
-    if gas.container is not None:
-        return jnp.ones_like(gas.temperature)
-    hotter = jnp.sqrt(num_particles / jnp.maximum(num_particles - 1, 1.0))
-    one = jnp.ones_like(gas.temperature)
-    loss = 1 - gas.reduced_law.restitution(one) ** 2
-    ratio = (1 - gas.reduced_law.restitution(hotter * one) ** 2) / jnp.where(loss > 0, loss, 1.0)
-    return hotter * jnp.where(loss > 0, ratio, 1.0)
-
-
-def with_rate_error(rows: CurveRows, model: AbstractModel, gas: Gas) -> CurveRows:
-    """Return a curve with the error of a model's cooling rate in a gas.
-
-    Args:
-        rows: the measured curve.
-        model: of the fit; kinetic theory gives the curve on which the error of a stochastic one
-            depends.
-        gas: the scene, with values of the unknowns.
-    """
-    known = np.asarray(rows.curve.times) * rows.faster
-    times = time_grid(known, rows.unit_time).times
-    exact = KineticTheory() if model.stochastic else model
-    curve = curve_of_program(exact, gas, times, rows.displacement is not None)
-    if not np.all(np.isfinite(np.asarray(curve.temperature))):
-        return rows
-    error_model = error_model_of_curve(gas, curve, rows.measurement.num_particles)
-    error = np.broadcast_to(model.rate_error(error_model), times.shape)
-    return replace(rows, rate_error=(times, np.asarray(error, float)))

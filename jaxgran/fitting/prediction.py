@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxgran.data.measurement import START_TIME
-from jaxgran.fitting.parameters import as_floats, power_of_line, with_parameters
+from jaxgran.fitting.guesses import power_of_line
+from jaxgran.fitting.parameters import as_floats, with_parameters
 from jaxgran.fitting.rows import CALIBRATION, FLOOR, ROTATION, SCATTER, WHITE, CurveRows
 from jaxgran.fitting.time_grid import TimeGrid, shift_with_t0, time_grid
 from jaxgran.models.base import AbstractModel

@@ -12,16 +12,10 @@ from jaxgran._utils.validation import POSITIVE, Domain
 from jaxgran.data.drop_test import SPHERE
 from jaxgran.data.measurement import START_TIME, Priors
 from jaxgran.fitting.comparison import Comparison, Residuals
-from jaxgran.fitting.parameters import (
-    SHARED,
-    Unknown,
-    domain_of,
-    extra_parameters,
-    halving_time,
-    prior_residuals,
-    residuals_and_slopes,
-)
+from jaxgran.fitting.guesses import halving_time
+from jaxgran.fitting.parameters import Unknown, domain_of, residuals_and_slopes
 from jaxgran.fitting.prediction import Element, PredictedCurve, predicted_curve, steady_curve
+from jaxgran.fitting.priors import SHARED, extra_parameters, prior_residuals
 from jaxgran.fitting.rows import FLOOR, WHITE, CurveRows, DropRows
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import Gas

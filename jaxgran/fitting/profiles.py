@@ -141,8 +141,8 @@ def with_wider_rate_error(problem: Problem, error: float) -> Problem:
     def widened(m: Any) -> Any:
         if not isinstance(m, CurveRows):
             return m
-        times, known = m.rate_error
-        return replace(m, rate_error=(times, known + error))
+        wider = m.rate_error._replace(error=m.rate_error.error + error)
+        return replace(m, rate_error=wider)
 
     return replace(problem, measurements=tuple(widened(m) for m in problem.measurements))
 

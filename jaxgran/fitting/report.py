@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxgran.data.curve import above_noise
 from jaxgran.data.drop_test import DropTest
-from jaxgran.data.header import GUESS
+from jaxgran.data.header_keys import GUESS
 from jaxgran.data.measurement import Measurement
 from jaxgran.fitting.alternatives import Alternative
 from jaxgran.fitting.goodness import SIGNIFICANCE

@@ -94,6 +94,18 @@ class Noise(NamedTuple):
     white: Any
 
 
+class RateError(NamedTuple):
+    """Relative standard error of a model's cooling rate along a curve.
+
+    Attributes:
+        times: at which it is known, s.
+        error: at these times.
+    """
+
+    times: Float[np.ndarray, "nodes"]
+    error: Float[np.ndarray, "nodes"]
+
+
 class Displacement(NamedTuple):
     """A measured <dr^2>.
 
@@ -128,7 +140,7 @@ class CurveRows:
         grains: what makes values of a finite number of grains scatter.
         faster: factor by which the measured gas cools faster because N is small.
         unit_time: mean free time of the scene, s.
-        rate_error: times, s, and the relative error of the model's cooling rate at them.
+        rate_error: of the model.
         rotation_accuracy: relative accuracy of the model's T_rot.
         displacement: <dr^2>; None where it is not used.
         offset: ln T and ln T_rot of the fitted model minus the values of the evaluated model,
@@ -145,7 +157,7 @@ class CurveRows:
     grains: Grains
     faster: float
     unit_time: float
-    rate_error: tuple[np.ndarray, np.ndarray]
+    rate_error: RateError
     rotation_accuracy: float = 0.0
     displacement: Displacement | None = None
     offset: np.ndarray | float = 0.0
@@ -213,11 +225,10 @@ class CurveRows:
             white: see `Noise`.
             model: factor of the error of the cooling rate.
         """
-        known, error = self.rate_error
         return Noise(
             inverse_number=self.grains.inverse_number * factor,
             first=np.asarray(self.grains.first),
-            rate_error=model * np.interp(times, known, error),
+            rate_error=model * np.interp(times, *self.rate_error),
             sample=np.asarray(self.grains.sample),
             white=np.asarray(white),
         )

@@ -2,22 +2,18 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import START_TIME, Measurement, Priors
+from jaxgran.fitting.guesses import guess_from_data, guess_from_drops, guess_start_time
 from jaxgran.fitting.measured_rows import curve_rows, with_rate_error
-from jaxgran.fitting.parameters import (
-    as_floats,
-    guess_from_data,
-    guess_from_drops,
-    guess_start_time,
-    known_start_time,
-    with_parameters,
-)
+from jaxgran.fitting.parameters import as_floats, with_parameters
+from jaxgran.fitting.priors import known_start_time
 from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.rows import CurveRows, DropRows
 from jaxgran.models.base import AbstractModel
@@ -60,14 +56,32 @@ class Request:
         return any(START_TIME in some for some in self.priors.values())
 
 
-def build_problem(request: Request) -> tuple[Problem, np.ndarray, list[str]]:
-    """Return the problem of a fit, a first guess of its unknowns, and notes on the data."""
+class Setup(NamedTuple):
+    """A fit that is ready to be searched.
+
+    Attributes:
+        problem: with the errors of the model's cooling rate at the first guess.
+        first: guess of the unknowns, in their unconstrained scale.
+        notes: on the data.
+    """
+
+    problem: Problem
+    first: Float[np.ndarray, "unknowns"]
+    notes: list[str]
+
+
+def build_problem(request: Request) -> Setup:
+    """Return the problem of a fit, with a first guess from the data.
+
+    Raises:
+        ValueError: if the model cannot compute the scene, or the first guess.
+    """
     rows, notes = _rows(request)
     problem = Problem.build(rows, request.model, request.names, request.separate, request.priors)
     guesses = _guesses(request, problem)
     first = problem.flat(_values_of_guesses(problem, guesses))
     with ThreadPoolExecutor(1) as thread:  # two programs are compiled at the same time
-        compiled = thread.submit(_compile_innovations, problem, first, *_configuration())
+        compiled = thread.submit(_compile_innovations, problem, first, _Configuration.current())
         problem = problem_with_rate_errors(problem, first)
         compiled.result()
     if request.start is not None:
@@ -77,7 +91,7 @@ def build_problem(request: Request) -> tuple[Problem, np.ndarray, list[str]]:
         }
         first = _better(problem, first, problem.flat(_values_of_guesses(problem, started)))
     problem.check_start(first)
-    return problem, first, notes
+    return Setup(problem, first, notes)
 
 
 def _rows(request: Request) -> tuple[tuple[CurveRows | DropRows, ...], list[str]]:
@@ -99,21 +113,22 @@ def _rows(request: Request) -> tuple[tuple[CurveRows | DropRows, ...], list[str]
 
 def _guesses(request: Request, problem: Problem) -> dict[str, Gas]:
     """Return the gas of each measurement with guesses of its free parameters."""
-    curves = {m.label: _guess_of_curve(request, m) for m in problem.curves}
+    of_curves = {m.label: _guess_of_curve(request, m) for m in problem.curves}
     drops = [m for m in problem.measurements if isinstance(m, DropRows)]
     of_drops = {m.label: guess_from_drops(m.scene, m.data, request.free) for m in drops}
     guesses: dict[str, Gas] = {}
     for m in problem.measurements:
         if isinstance(m, CurveRows):
-            guesses[m.label] = curves[m.label]
-        elif curves:
-            of_first_curve = curves[problem.curves[0].label]
+            guesses[m.label] = of_curves[m.label]
+        elif of_curves:
+            of_first_curve = of_curves[problem.curves[0].label]
             guesses[m.label] = with_values_of(m.gas, of_first_curve, request.names)
         else:
             guesses[m.label] = m.scene.replace(**of_drops[m.label])
     # A drop test overrides all guesses except for A and eps; the last one counts.
-    known = {name: x for some in of_drops.values() for name, x in some.items()}
-    better = {name: x for name, x in known.items() if name not in GUESSED_FROM_CURVES}
+    better = {name: x for some in of_drops.values() for name, x in some.items()}
+    for name in GUESSED_FROM_CURVES:
+        better.pop(name, None)
     for label, gas in guesses.items():
         own = {name: x for name, x in better.items() if name in gas.domains}
         guesses[label] = gas.replace(**own)
@@ -132,18 +147,28 @@ def _guess_of_curve(request: Request, rows: CurveRows) -> Gas:
 
 def _better(problem: Problem, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the unknowns of lower -2 ln L, the first ones if both cannot be computed."""
-    starts = [(problem.evaluate(flat).value, flat) for flat in (first, second)]
-    return min(starts, key=lambda pair: (np.isnan(pair[0]), pair[0]))[1]
+
+    def misfit(flat: np.ndarray) -> tuple[bool, float]:
+        value = problem.evaluate(flat).value
+        return bool(np.isnan(value)), value
+
+    return min((first, second), key=misfit)
 
 
-def _configuration() -> tuple[bool, Any]:
-    """Return the configuration of JAX that a user may set for one thread alone."""
-    config: Any = jax.config
-    return config.jax_enable_x64, config.jax_default_device
+class _Configuration(NamedTuple):
+    """Configuration of JAX that a user may set for one thread alone."""
+
+    x64: bool
+    device: Any
+
+    @classmethod
+    def current(cls) -> "_Configuration":
+        config: Any = jax.config
+        return cls(config.jax_enable_x64, config.jax_default_device)
 
 
-def _compile_innovations(problem: Problem, flat: np.ndarray, x64: bool, device: Any) -> None:
-    with jax.enable_x64(x64), jax.default_device(device):
+def _compile_innovations(problem: Problem, flat: np.ndarray, config: _Configuration) -> None:
+    with jax.enable_x64(config.x64), jax.default_device(config.device):
         problem.compile_innovations(flat)
 
 

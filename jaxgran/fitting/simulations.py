@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 from tqdm import tqdm
 
-from jaxgran.data.curve import CoolingCurve, Run
+from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.run_options import Run
 from jaxgran.fitting.comparison import Comparison
 from jaxgran.fitting.descent import Descent, Loss
 from jaxgran.fitting.information import FEW_PARTICLES, decrease_with_variance, inverse
@@ -74,6 +75,18 @@ class Simulation(NamedTuple):
     variance: Float[np.ndarray, "values"]
 
 
+class _Estimate(NamedTuple):
+    """Gauss-Newton estimate of one simulation.
+
+    Attributes:
+        flat: the estimate.
+        noise: its covariance by the scatter of the replicas.
+    """
+
+    flat: Float[np.ndarray, "p"]
+    noise: Float[np.ndarray, "p p"]
+
+
 class Average(NamedTuple):
     """Mean of the Gauss-Newton estimates of some simulations.
 
@@ -99,7 +112,7 @@ class Simulations:
         theory: the same measurement for kinetic theory, which knows how N grains scatter.
         key: of the random numbers.
         progress: whether to show progress bars.
-        starts: of equilibrated spheres, which all runs share and add to (`jaxgran.data.curve.Run`).
+        starts: of equilibrated spheres, which all runs share and add to (`jaxgran.extend.Run`).
             They depend on no parameter of the law, and velocities are drawn anew.
     """
 
@@ -164,11 +177,11 @@ class Simulations:
         # T and T_rot are split, because the variance is averaged over neighbouring times.
         parts = [variance_of_mean(part) for part in np.split(deviation, 2, axis=1)]
         simulation = Simulation(
-            np.asarray(flat),
-            np.asarray(values),
-            np.asarray(slope),
-            deviation,
-            np.concatenate(parts),
+            flat=np.asarray(flat),
+            values=np.asarray(values),
+            slope=np.asarray(slope),
+            deviation=deviation,
+            variance=np.concatenate(parts),
         )
         return simulation, curve
 
@@ -184,29 +197,27 @@ class Simulations:
         variance = np.mean([s.variance for s in near], axis=0) / len(near)
         comparison = self.comparison_with_theory(near[-1].flat, variance)
         estimates = []
-        noises = []
         for s in near:
             # Slope and values of one run share their noise, whose product would move the estimate:
             # each run takes the mean slope of the others.
             others = [x.slope for x in near if x is not s] or [s.slope]
-            estimate, noise = self._estimate(s, np.mean(others, axis=0), comparison)
-            estimates.append(estimate)
-            noises.append(noise)
+            estimates.append(self._estimate(s, np.mean(others, axis=0), comparison))
         slope = np.mean([s.slope for s in near], axis=0)
         sensitivity = comparison.whiten(slope)
         information = sensitivity.T @ sensitivity
-        noise = np.mean(noises, axis=0)
+        noise = np.mean([x.noise for x in estimates], axis=0)
         expected = self.expected_noise(comparison, slope, information, len(near[-1].deviation))
         if expected is not None:
             degrees = sum(len(s.deviation) - 1 for s in near)
             total = THEORY_DEGREES + degrees
             noise = (THEORY_DEGREES * expected + degrees * noise) / total
-        return Average(np.mean(estimates, axis=0), information, noise / len(near), comparison)
+        flat = np.mean([x.flat for x in estimates], axis=0)
+        return Average(flat, information, noise / len(near), comparison)
 
     def _estimate(
         self, s: Simulation, slope: Float[np.ndarray, "values p"], comparison: Comparison
-    ) -> tuple[Float[np.ndarray, "p"], Float[np.ndarray, "p p"]]:
-        """Return the Gauss-Newton estimate of one simulation, and its noise by the replicas."""
+    ) -> _Estimate:
+        """Return the Gauss-Newton estimate of one simulation, by some slope of its values."""
         p = s.flat.size
         difference = self.measured - s.values
         columns = np.concatenate([difference[:, None], slope, s.deviation.T], axis=1)
@@ -215,7 +226,7 @@ class Simulations:
         gain = np.linalg.pinv(slope, rcond=self.model.derivative_accuracy)
         replicas = deviation.shape[1]
         shift = gain @ deviation / (replicas * (replicas - 1)) ** 0.5
-        return s.flat + (gain @ difference)[:, 0], shift @ shift.T
+        return _Estimate(s.flat + (gain @ difference)[:, 0], shift @ shift.T)
 
     def expected_noise(
         self,

@@ -55,7 +55,7 @@ class Truth:
     Attributes:
         name: in words.
         shifts: of parameters, in their unconstrained scale, by name.
-        effect: of `jaxgran.data.header.ABSENT` that the scene lacks; "" without one.
+        effect: of `jaxgran.data.header_keys.ABSENT` that the scene lacks; "" without one.
         elements: of the gas, by field.
     """
 

@@ -11,7 +11,8 @@ import numpy as np
 from equinox import AbstractClassVar
 from jaxtyping import Array, Float
 
-from jaxgran.data.curve import CoolingCurve, Run
+from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.run_options import Run
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.scene.gas import Gas
 

@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced, is_known, known_part, nan_where
-from jaxgran.data.curve import CoolingCurve, Run
+from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.run_options import Run
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.scales import scales_at
 from jaxgran.scene.elements import (

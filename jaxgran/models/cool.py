@@ -14,8 +14,10 @@ from jaxgran._utils import status
 from jaxgran._utils.tracing import is_known
 from jaxgran._utils.validation import check_bool, checked_times
 from jaxgran.data.checkpoint import saved_at_termination
-from jaxgran.data.curve import CoolingCurve, Particles, Run
+from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.files import check_writable
+from jaxgran.data.particles import Particles
+from jaxgran.data.run_options import Run
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.choose import choose_model

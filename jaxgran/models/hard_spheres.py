@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from jaxgran._utils.tracing import any_traced, concrete_array
 from jaxgran._utils.validation import Domain, checked_float, python_int
-from jaxgran.data.curve import Particles
+from jaxgran.data.particles import Particles
 from jaxgran.models import checks
 from jaxgran.models.base import Limitation
 from jaxgran.models.error_model import ErrorModel

@@ -19,7 +19,8 @@ from jaxgran._utils.tracing import (
     pad_to,
     truncate_to,
 )
-from jaxgran.data.curve import DEFAULTS, CoolingCurve, Run
+from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.run_options import DEFAULTS, Run
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.error_model import ErrorModel

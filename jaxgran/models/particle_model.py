@@ -14,7 +14,10 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced, nan_where
-from jaxgran.data.curve import DEFAULTS, QUANTITIES, CoolingCurve, Particles, Run
+from jaxgran.data.curve import CoolingCurve
+from jaxgran.data.particles import Particles
+from jaxgran.data.quantities import QUANTITIES
+from jaxgran.data.run_options import DEFAULTS, Run
 from jaxgran.gradients.rule import Result
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel

@@ -12,7 +12,7 @@ import scipy  # which imports scipy.spatial at its first use
 
 from jaxgran._utils.tracing import any_traced, concrete_array
 from jaxgran._utils.validation import POSITIVE, checked_float, python_int
-from jaxgran.data.curve import Particles
+from jaxgran.data.particles import Particles
 from jaxgran.models.base import Limitation
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.models.spheres import AbstractSpheres, ArraySizes

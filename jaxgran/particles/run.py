@@ -43,8 +43,8 @@ from tqdm import tqdm
 from jaxgran._utils import status
 from jaxgran._utils.tracing import fast_compilation, nan_where, near_map_limit
 from jaxgran.data import checkpoint
-from jaxgran.data.curve import Run
-from jaxgran.data.particles import Sphere, Trajectory
+from jaxgran.data.run_options import Run
+from jaxgran.data.trajectory import Sphere, Trajectory
 from jaxgran.gradients.rule import Records, Result
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import AbstractDynamics, AbstractProcess

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxgran.data.curve import Particles
+from jaxgran.data.particles import Particles
 from jaxgran.scene.gas import Gas
 
 

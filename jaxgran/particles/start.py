@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray
 
 from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced
-from jaxgran.data.curve import Particles
+from jaxgran.data.particles import Particles
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import AbstractProcess
 from jaxgran.particles.neighbours.lists import search_pairs

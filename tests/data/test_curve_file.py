@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxgran
-from jaxgran.data.header import gas_of_header, priors_of_header
+from jaxgran.data.header import gas_of_header
+from jaxgran.data.measurement_header import priors_of_header
 from tests.beads import glass_beads
 
 HEADER = "# eta: 0.05\n# diameter: 0.002\n# density: 2500\n# Y: 5e7\n# nu: 0.22\n# T0: 0.01\n"

@@ -8,8 +8,9 @@ from pytest import approx
 
 import jaxgran
 from jaxgran import read_measurement
-from jaxgran.data.header import gas_of_header, priors_of_header
-from jaxgran.data.tables import header_in_si
+from jaxgran.data.header import gas_of_header
+from jaxgran.data.header_lines import header_in_si
+from jaxgran.data.measurement_header import priors_of_header
 from tests.data.curve_files import (
     GAS,
     PLAIN,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.data.particles import Sphere, Trajectory
+from jaxgran.data.trajectory import Sphere, Trajectory
 from tests.beads import glass_beads
 
 gsd_hoomd = pytest.importorskip("gsd.hoomd")

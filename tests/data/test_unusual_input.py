@@ -16,7 +16,7 @@ from pytest import approx
 import jaxgran
 from jaxgran import read_curve, read_measurement, write_curve
 from jaxgran.data import files
-from jaxgran.data.header import absent_of_header, priors_of_header
+from jaxgran.data.measurement_header import absent_of_header, priors_of_header
 from tests.data.curve_files import (
     CURVE,
     GAS,

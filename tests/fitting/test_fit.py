@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.fitting.parameters import guess_from_data
+from jaxgran.fitting.guesses import guess_from_data
 from jaxgran.fitting.report import report
 from tests.beads import glass_beads
 from tests.fitting.curves import (

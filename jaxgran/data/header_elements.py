@@ -1,0 +1,93 @@
+"""Elements of a gas that the header of a file describes: roughness, walls, drag and a drive."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from jaxgran.data.header_keys import GUESS, GUESSES, UNSUPPORTED_KEYS
+from jaxgran.data.header_values import header_number
+from jaxgran.scene.elements import Frictional, Rough, Walls
+from jaxgran.scene.gas import ELEMENTS
+from jaxgran.scene.parameters import fields_of
+
+
+def elements_of_header(header: dict[str, str]) -> dict[str, Any]:
+    """Return the elements that a header describes, as keyword arguments of `jaxgran.Gas`.
+
+    Args:
+        header: for rough spheres beta_t and, if they are not 0.4 and 0, reduced_inertia,
+            4 I/(m sigma^2), and T_rot_0, T_rot = I <w^2>/(d_rot m) at t = 0, m^2/s^2, and, if they
+            slide, Coulomb's coefficient friction; for lasting contacts with friction
+            tangential_damping and friction (`jaxgran.Frictional`, numbers without a unit) in place
+            of beta_t; for walls container_side, of a cube, m, or "8 x 6 x 4 cm",
+            wall_restitution and, for rough walls, wall_beta_t; for drag gamma, 1/s, of
+            dv/dt = -gamma v; for a drive by white noise drive_strength, m^2/s^3, of
+            dT/dt = drive_strength.
+
+    Raises:
+        ValueError: for a key that needs another one, a value outside its range, and for effects
+            that no model has: gravity, mixtures, rods, ellipsoids, cohesion and charges.
+    """
+    _check_supported(header)
+    lasting = "tangential_damping" in header
+    rough = "beta_t" in header
+    if lasting and rough:
+        raise ValueError(
+            "the header gives both beta_t (instantaneous impacts) and tangential_damping (lasting "
+            "contacts). Leave out beta_t for SoftSpheres(N), or tangential_damping for the other "
+            "models"
+        )
+    unused = Rough if lasting or ("friction" in header and not rough) else Frictional
+    elements = {}
+    for name, kinds in ELEMENTS.items():
+        for kind in kinds:
+            arguments = {} if kind is unused else _arguments(kind, header)
+            if arguments:
+                elements[name] = kind(**arguments)
+    return elements
+
+
+def _check_supported(header: dict[str, str]) -> None:
+    """Raise ValueError for a key of an effect that no model has."""
+    for key, (neutral, reason) in UNSUPPORTED_KEYS.items():
+        if key in header and (neutral is None or header_number(header, key) != neutral):
+            advice = "" if neutral is None else f" or set it to {neutral:g}"
+            raise ValueError(
+                f"the header gives {key}: {reason}. No model of jaxgran supports it; fit a curve "
+                f"of equal spheres without it, and leave {key} out{advice}"
+            )
+
+
+def _arguments(kind: type, header: dict[str, str]) -> dict[str, Any]:
+    """Return the arguments of an element that a header gives, {} if it gives none."""
+    keys = {field: p.symbol for field, p in fields_of(kind.__name__).items() if p.symbol}
+    if kind is Walls:
+        keys["restitution"] = "wall_restitution"
+    fields = {key: field for field, key in keys.items()}
+    given = [key for key in header if key in fields]
+    if not given:
+        return {}
+    required = (x.name for x in dataclasses.fields(kind) if x.default is dataclasses.MISSING)
+    if missing := [keys[x] for x in required if keys[x] not in header]:
+        fitted = f", or the line '# {missing[0]}: guess' to fit it (--free {missing[0]})"
+        raise ValueError(
+            f"the header gives {given[0]} without {missing[0]}; add {missing[0]}"
+            + (fitted if missing[0] in GUESSES else "")
+        )
+    values = header | {key: GUESSES[key] for key in GUESSES if header.get(key) == GUESS}
+    arguments: dict[str, Any] = {}
+    for key in given:
+        if key == "container_side":
+            arguments[fields[key]] = header_sides(values)
+        else:
+            arguments[fields[key]] = header_number(values, key)
+    return arguments
+
+
+def header_sides(header: Mapping[str, Any]) -> float | list[float]:
+    """Return the side of a cubic or square container, or its d sides, m."""
+    sides = [
+        header_number({"container_side": part.strip()}, "container_side")
+        for part in str(header["container_side"]).split("x")
+    ]
+    return sides if len(sides) > 1 else sides[0]
