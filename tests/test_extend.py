@@ -49,7 +49,7 @@ def test_the_verdict_asks_the_model():
     assert result.grade == "not consistent"
     assert "velocities are not Maxwellian" in result.reasons
     assert result.verdict == (
-        "Haff law cannot be trusted in this scene, though this curve fits. "
+        "Haff law cannot be trusted in this scene, although the fit to this curve is good. "
         "This scene needs kinetic theory, which includes a_2."
     )
 

@@ -45,9 +45,12 @@ def run_plan(
         import_extra("jinja2", "report")  # before the long part
     picture = Path(f"{path.stem}-plan.png") if out is None else out
     record = picture.with_suffix(".json")
-    if picture == record:
-        raise ValueError(f"--out {out} is the name of the JSON file. Give the picture another one.")
     html = picture.with_suffix(".html")
+    if picture in (record, html):
+        raise ValueError(
+            f"--out {out} must not end in .json or .html, the endings of the other files. Give the "
+            "picture another name, as plan.png."
+        )
     written = [picture, record, html] if page else [picture, record]
     for file in written:
         check_new(file, overwrite)

@@ -21,24 +21,27 @@ QUESTIONS = {
     "unit of a column": "is it in {unit}? Then write {name} ({unit}) as the name of the column",
     "T0 is 1": "T0 is 1 m^2/s^2: is the temperature divided by its first value? Then give T0 in "
     "m^2/s^2, and multiply T by it",
-    "large error": "{key}_err is {error:.6g} {unit}, more than {key}, {value:.6g}: a number "
-    "without a unit is in the unit of {key}. Is it in {unit}? Then write it behind",
+    "large error": "{key}_err is {error:.6g} {unit}, larger than {key} itself, {value:.6g} {unit}: "
+    "an error without a unit is read in the unit of {key}. If it is in {unit}, write {unit} after "
+    "it",
+    "large error of a number": "{key}_err is {error:.6g}, larger than {key} itself, {value:.6g}: "
+    "check it",
     # errors
     "T_err and N": "T_err is at least {ratio:.2g} times {word} than the scatter of T of N = "
     "{number:g} particles in {replicas:g} run(s): do N, replicas and T_err belong to this curve, "
     "and is T_err a standard error of the mean?",
-    "digits": "{column}_err, {error:.2g}, is less than the digits of {column} tell, "
-    "{digit:.2g}/sqrt(12): the rounding counts as an error in addition. Write more digits of "
-    "{column}",
+    "digits": "{column}_err = {error:.2g} is smaller than the rounding error of {column} (its last "
+    "digit, {digit:.2g}, over sqrt(12); both in SI). The fit adds the rounding error. Write more "
+    "digits of {column}",
     # the start and the loss
-    "late start": "by the first rows T is T0 = {T0:g} m^2/s^2 at t = {begin:.6g} s and not at 0: "
-    "does the clock of the file start earlier than the gas? Then subtract that time, or fit it: "
-    "--free A t0",
+    "late start": "by the first rows, extrapolated, T is T0 = {T0:g} m^2/s^2 at t = {begin:.6g} s, "
+    "not at t = 0: did the clock start before the gas began to cool? Then subtract this time from "
+    "t, or fit it: --free A t0",
     "loss": "T falls to a half in {halving:.3g} mean free times of the header's gas (eta, "
     "diameter, T0), where usual values are {low:.2g} to {high:.2g}: {question}",
-    "unit of t": "is t in {units}? Then name the column t ({unit})",
+    "unit of t": "is t in {units}? Then name the column t ({unit}).",
     "any unit of the header": "are t, eta, diameter and T0 in the units that the file says?",
-    "steps": "; is it in steps or frames? Then multiply it by their duration",
+    "steps": " Or is t counted in steps or frames? Then multiply t by the duration of one",
     # the definition of T
     "mean_speed": "mean_speed is read as the speed in three dimensions. If it contains only the "
     "two components that one camera sees, T is 0.62 of the true one and A 37 % too large: name the "
@@ -47,8 +50,8 @@ QUESTIONS = {
     "{question}. If T is right, correct T0",
     "definition": "is the column {words}? Then {rename}multiply {what} by {factor:.6g}",
     "rename": "name the column {column}, or ",
-    "any definition": "are both <v^2>/d of one grain, in m^2/s^2? (Neither kelvin, nor the energy "
-    "of all N grains, nor T over its first value)",
+    "any definition": "are T and T0 both <v^2>/d, averaged over the grains, in m^2/s^2? (Not in "
+    "kelvin, not the energy of all N grains, not T over its first value)",
     # impacts
     "sign of eps_t": "{name} falls as impacts become more grazing, and Coulomb's law makes it rise "
     "to 1: is it beta_t = -{name}? Then change its sign",

@@ -51,7 +51,9 @@ def ask_about_header(values: dict[str, float]) -> Iterator[str]:
         if key == "T0" and value == 1:
             yield ask("T0 is 1")
         if key != "t0" and error > value > 0:
-            yield ask("large error", key=key, error=error, unit=UNITS[key], value=value)
+            unit = UNITS[key]
+            name = "large error of a number" if unit == "1" else "large error"
+            yield ask(name, key=key, error=error, unit=unit, value=value)
 
 
 def ask_about_speeds(columns: dict[str, np.ndarray]) -> Iterator[str]:

@@ -12,7 +12,7 @@ allows for one effect more than the data show. Where they show independent error
 beside all other effects: otherwise no smooth effect could be as good.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -73,7 +73,7 @@ class Alternative(NamedTuple):
         distinguishable: True if the data exclude the alternative, or allow so little of it that it
             widens the range of the first parameter by less than 10 %.
         error_reduction_needed: factor by which the errors must decrease for that; 1 if it is
-            distinguishable.
+            distinguishable, or has no A.
         restitution: eps of an alternative in which it is constant, so that A has no meaning; None
             for all others. It is not part of the range.
 
@@ -110,17 +110,16 @@ class Explanations(NamedTuple):
     alternatives: tuple[Alternative, ...]
     significant: float
 
-    def ranges(self, without: Sequence[Alternative] = ()) -> tuple[np.ndarray, np.ndarray]:
+    def ranges(self, absent: Collection[str] = ()) -> tuple[np.ndarray, np.ndarray]:
         """Return the 95 % range of the free parameters over all explanations.
 
         One that fits significantly worse than the best one is excluded.
 
         Args:
-            without: explanations that are left out.
+            absent: effects whose alternatives are left out.
         """
-        considered = [
-            x for x in (self.law, *self.alternatives) if x not in without and x.restitution is None
-        ]
+        others = [x for x in self.alternatives if x.effect not in absent and x.restitution is None]
+        considered = [self.law, *others]
         best = max(x.improvement for x in considered)
         allowed = [
             x
@@ -363,15 +362,17 @@ class _Summary(NamedTuple):
         low = allowed.low
         high = allowed.high
         restitution = None
+        widening = 0.0
+        is_excluded = best.value > self.best.value + self.significant
+        is_distinguishable = is_excluded
         if not varied.keeps_A:
             low = beside.low
             high = beside.high
             restitution = _constant_restitution(self.problem, best)
-        widening = 0.0
-        is_excluded = best.value > self.best.value + self.significant
-        if varied.keeps_A and not is_excluded:
+        elif not is_excluded:
             beyond = max(beside.low[0] - low[0], high[0] - beside.high[0])
             widening = beyond / abs(beside.estimate[0])
+            is_distinguishable = widening < DISTINGUISHABLE_SHARE
         improvement = float(self.base.value - best.value)
         return Alternative(
             name=AND.join(kind.name for kind in effects),
@@ -383,7 +384,7 @@ class _Summary(NamedTuple):
             low=low,
             high=high,
             preferred=bool(improvement - beside.improvement > self.significant),
-            distinguishable=bool(widening < DISTINGUISHABLE_SHARE),
+            distinguishable=bool(is_distinguishable),
             error_reduction_needed=float(max(widening / DISTINGUISHABLE_SHARE, 1.0)),
             restitution=restitution,
         )

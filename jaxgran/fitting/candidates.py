@@ -6,8 +6,9 @@ computes them.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
+from itertools import chain, count
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -356,8 +357,7 @@ def combined(first: Change, second: Change, measurement: Measurement) -> Planned
     If the second one gives several, too, only those that it makes of the first curve are taken.
 
     Returns:
-        None if the first addition does not apply, or none of its measurements is a curve, or if the
-        second one does not apply to its only measurement.
+        None if the first addition does not apply, or the second one to none of its curves.
     """
     changed = first(measurement)
     if changed is None:
@@ -371,7 +371,8 @@ def combined(first: Change, second: Change, measurement: Measurement) -> Planned
     of_first_curve = both[labels[0]]
     if isinstance(of_first_curve, dict):
         return _with_added(changed, labels[0], of_first_curve)
-    return changed | {label: m for label, m in both.items() if isinstance(m, Measurement)}
+    changed_twice = {label: m for label, m in both.items() if isinstance(m, Measurement)}
+    return changed | changed_twice if changed_twice else None
 
 
 def _with_added(
@@ -386,11 +387,15 @@ def _with_added(
     for name, m in added.items():
         if name in of_curve:
             result[label] = m
-        elif name in measurements:
-            result[f"{name} 2"] = m
         else:
-            result[name] = m
+            result[_free_label(name, result)] = m
     return result
+
+
+def _free_label(name: str, labels: Collection[str]) -> str:
+    """Return a name, or the first of ``name 2``, ``name 3``, ... that is not among labels."""
+    numbered = (f"{name} {number}" for number in count(2))
+    return next(label for label in chain([name], numbered) if label not in labels)
 
 
 def _labels_of_curves(measurements: dict[str, Measurement]) -> list[str]:

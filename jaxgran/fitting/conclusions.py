@@ -56,6 +56,9 @@ MAX_ERROR_OF_N = 1.0
 NEARLY_CERTAIN = 0.99
 """Probability by chance from which it is not reported in digits."""
 
+MIN_REDUCTION = 1.1
+"""Smallest factor by which errors are said to have to shrink: less would be rounded to 1."""
+
 MIN_PARTICLES = 50
 """Least number of particles of a model whose noise is known."""
 
@@ -197,22 +200,22 @@ def _narrowing(result: Fit, explanations: Explanations) -> Message | None:
     """Return which effects, known to be absent, would narrow the range; None if none would."""
     wide = [x for x in explanations.alternatives if x.effect and not x.distinguishable]
     effects = sorted({x.effect for x in wide})
-    excluded = [x for x in explanations.alternatives if x.effect in effects]
-    others = [x for x in (explanations.law, *explanations.alternatives) if x not in excluded]
-    best = max(x.improvement for x in (explanations.law, *explanations.alternatives))
-    if not wide or max(x.improvement for x in others) < best - NARROWING_LOSS:
+    every = [explanations.law, *explanations.alternatives]
+    best = max(x.improvement for x in every)
+    best_of_others = max(x.improvement for x in every if x.effect not in effects)
+    if not wide or best_of_others < best - NARROWING_LOSS:
         return None
-    low, high = explanations.ranges(without=excluded)
-    widest_low, widest_high = explanations.ranges()
-    gain = max(low[0] - widest_low[0], widest_high[0] - high[0])
+    low, high = (float(end[0]) for end in explanations.ranges(absent=effects))
+    lowest, highest = (float(end[0]) for end in explanations.ranges())
+    gain = max(low - lowest, highest - high)
     if not gain > DISTINGUISHABLE_SHARE * abs(result.estimate[0]):
         return None
     return Message(
         "narrowing",
         effects=listed("neither", effects),
-        range=_range(result, float(low[0]), float(high[0])),
+        range=_range(result, low, high),
         names=listed("names", effects),
-        given=listed("names", (DECLARABLE[effect][1] for effect in effects)),
+        given=listed("names", (DECLARABLE[effect].keys for effect in effects)),
     )
 
 
@@ -305,7 +308,10 @@ def _doubt(result: Fit) -> Message | None:
         return None
     low, high = _ends(result)
     span = _range(result, low, high)
-    possible = [x.name for x in result.alternatives if not x.distinguishable]
+    # One without A narrows nothing: the first line says that A would have no meaning.
+    possible = [
+        x.name for x in result.alternatives if x.restitution is None and not x.distinguishable
+    ]
     if possible:
         simplest = min(possible, key=lambda name: name.count(AND))
         return Message("possible", name=simplest, range=span)
@@ -362,7 +368,7 @@ def _reasons_of_misfit(result: Fit, misfit: _Misfit) -> Iterator[Message]:
             as_few = Message("as few", number=_two_digits(known[0] / result.reduced_chi2))
         yield Message("scatters more", as_few=as_few)
     if misfit.scatters_less:
-        yield Message("scatters less" if misfit.is_significant else "errors too large")
+        yield Message("scatters less" if misfit.is_smooth else "errors too large")
 
 
 def _two_digits(x: float) -> float:
@@ -466,7 +472,7 @@ def _alternatives(result: Fit) -> Iterator[Message]:
             "eps": alternative.restitution,
             "improvement": alternative.improvement,
             "range": _range(result, low, high),
-            "factor": _two_digits(alternative.error_reduction_needed),
+            "factor": _two_digits(max(alternative.error_reduction_needed, MIN_REDUCTION)),
         }
         if alternative.preferred:
             yield Message("law is preferred" if is_law else "is preferred", **values)

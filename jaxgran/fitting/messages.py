@@ -13,21 +13,22 @@ MESSAGES = {
     "below": "{symbol} is below {high:.3g} {unit}",
     "above": "{symbol} is above {low:.3g} {unit}",
     "unknown": "{symbol} is not determined",
-    "constant": "{headline}. A constant coefficient of restitution, {eps:.3g}, explains the data "
-    "{how_well}: then A has no meaning",
-    "narrowing": "without {effects}, {range}: if this is known, declare `absent: {names}`, or give "
-    "{given}",
+    "constant": "{headline}. Impacts of constant restitution, eps = {eps:.3g}, explain the data "
+    "{how_well}; A would then have no meaning",
+    "narrowing": "with no {effects}, {range}. If this absence is known, declare `absent: {names}`; "
+    "if the effect is present, describe it by {given}",
     # parts of it
-    "as well": "as well",
+    "as well": "equally well",
     "better": "better",
     # the verdict
     "not converged": "The search did not converge: do not trust its estimates.",
     "not consistent": "{model_is} not consistent with {data}: do not trust the estimates. "
     "{preferred} {remedy}",
-    "not trusted": "{Model} cannot be trusted in this scene, though {data} {fit}. {remedy}",
+    "not trusted": "{Model} cannot be trusted in this scene, although the fit to {data} is good. "
+    "{remedy}",
     "determined": "{model_is} consistent with {data}, {who_determines} {symbol}: {range}. {edge}",
-    "not determined": "{model_is} consistent with {data}, which {do} not determine {symbol}: "
-    "{why}. {edge}",
+    "not determined": "{model_is} consistent with {data}, but {symbol} is not determined: {why}. "
+    "{edge}",
     "not compared": "{model_is} consistent with {data}. Alternatives were not compared: the range "
     "of {symbol} that they allow is not known. {edge}",
     # parts of it
@@ -43,21 +44,21 @@ MESSAGES = {
     "mainly the curves": "and the curves determine",
     "all together": "which together determine",
     "edge": "The scene is at the edge of the model's validity.",
-    "other minima": "other parameters fit {data} as well",
-    "possible": "{name} cannot be excluded, and {range}",
+    "other minima": "other values of the parameters fit {data} equally well",
+    "possible": "{name} cannot be excluded; over all explanations {range}",
     # reasons
     "chi2": "reduced chi^2 is {reduced:.3g} for {degrees} degrees of freedom (probability by "
     "chance: {chance})",
     "scatters more": "the data scatter more about the model than their errors and N equal spheres "
-    "allow: another effect, a mixture of sizes, eps that scatters, fewer grains than given, or "
-    "noise of the measurement {as_few}",
-    "scatters less": "the curve scatters less than N equal spheres do: grains that walls cool, "
-    "more grains than given, or a curve that was smoothed",
+    "allow; possible causes: another effect, a mixture of sizes, eps that scatters, fewer grains "
+    "than given, or noise of the measurement{as_few}",
+    "scatters less": "the curve scatters less than N equal spheres do; possible causes: walls that "
+    "cool the grains, more grains than given, or smoothing of the curve",
     "rising": "T rises from {first:.3g} to {last:.3g} m^2/s^2, and nothing drives this gas: "
     "check the order of the rows and the noise of the measurement, or give drive_strength",
     "box": "the box of {number} spheres {walls}",
     "gravity": "gravity is taken as absent: in one simulated box with walls of restitution 0.8, "
-    "0.01 g made A 9 % too small",
+    "a gravity of 0.1 m/s^2 made A 9 % too small",
     "errors too large": "the residuals are smaller than the errors of T allow by chance: these "
     "errors are too large, or they are common to the points",
     "scatter of eps": "eps of the impacts scatters by {scatter:.2g} beyond its errors",
@@ -71,19 +72,19 @@ MESSAGES = {
     "of particles": "the range over alternatives comes from kinetic theory, shifted to the fitted "
     "curve",
     "is preferred": "{name} added to the model decreases -2 ln L by {improvement:.3g}, which "
-    "happens by chance in less than 1 % of fits: with it {range}",
+    "happens by chance in less than 1 % of fits; in this case {range}",
     "law is preferred": "{name}, {eps:.3g}, in place of the fitted law decreases -2 ln L by "
     "{improvement:.3g}, which happens by chance in less than 1 % of fits: A has no meaning then",
-    "law is possible": "{name}, {eps:.3g}, in place of the fitted law cannot be excluded: A has no "
-    "meaning then; to exclude it, the errors must be {factor:g} times smaller",
-    "outside": "the estimate {estimate:.3g} lies outside of this range, because it assumes that "
-    "the preferred alternative is absent",
-    "is possible": "{name} cannot be excluded: with it {range}; to exclude it, the errors must be "
-    "{factor:g} times smaller",
+    "law is possible": "{name}, {eps:.3g}, in place of the fitted law cannot be excluded: A would "
+    "then have no meaning",
+    "outside": "the estimate {estimate:.3g} lies outside this range, because the estimate assumes "
+    "that the preferred alternative is absent",
+    "is possible": "{name} cannot be excluded; in this case {range}; errors {factor:g} times "
+    "smaller would exclude this explanation or make it negligible",
     "outliers": "far outliers at {places}: check them and their error bars; without them {symbol} "
     "is {value:.3g} +- {error:.2g}",
-    "errors of T": "T scatters by {percent:.2g} % more than its grains can: taken for independent "
-    "errors of T, beside which all else is fitted. {advice}",
+    "errors of T": "T scatters more than its grains can: the fit adds an independent error of "
+    "{percent:.2g} % to each T, beside every other effect. {advice}",
     "distant": "nearly every T differs from the fitted one by more than a factor of {ratio:g}: "
     "alternatives were not compared; check the units, the scale of T and T0",
     "max_steps": "the search did not converge: free fewer parameters, or in Python increase "
@@ -95,21 +96,21 @@ MESSAGES = {
     "undetermined": "{data} {do} not determine {names}: {why}; free fewer parameters",
     "another minimum": "-2 ln L has another, equally good minimum at {places}: {data} {do} not "
     "distinguish them",
-    "slopes": "the derivatives through particles err by an estimated {share:.2g} %, which the "
-    "standard error includes: more replicas reduce it, and where the gas has a flow "
-    "differences=0.3 in Python",
+    "slopes": "the error of the derivatives through particles is estimated as {share:.2g} %, which "
+    "the standard error includes: use more replicas or, if the gas has a flow, differences=0.3 (in "
+    "Python)",
     # parts of them
     "chance": "{percent:.2g} %",
     "nearly certain": "over 99 %",
-    "as few": "(some {number:g} grains would scatter as much)",
+    "as few": "; about {number:g} grains would scatter as much",
     "far from walls": "far from walls",
     "in vacuum": "in vacuum",
     "homogeneous": "at homogeneous density",
     "in some": "{what} ({labels})",
     "errors are given": "If T_err are errors of the measurement, say so: `errors: measured`",
     "no errors are given": "Give T_err if they are known",
-    "weak": "it hardly depends on {names} {hint}",
-    "combination": "it depends only on a combination of {names} {hint}",
+    "weak": "the computed values hardly depend on {names} {hint}",
+    "combination": "the computed values depend only on a combination of {names} {hint}",
     "forgets": "(a cooling gas forgets its initial temperature)",
     "A and Y": "(in a gas of hard spheres A and Y enter only as A Y^(2/5))",
 }
@@ -158,7 +159,8 @@ class Message:
 
     def __str__(self) -> str:
         """Return the words, without the blanks that empty values leave."""
-        words = MESSAGES[self.name].format(**self.values).replace("  ", " ").strip()
+        words = MESSAGES[self.name].format(**self.values)
+        words = words.replace("  ", " ").replace(" ,", ",").strip()
         return f"{self.of}: {words}" if self.of else words
 
 

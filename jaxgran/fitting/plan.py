@@ -157,13 +157,12 @@ def plan(
 
     A noise-free curve, T(t) by kinetic theory at the times of the measurement with its errors, is
     fitted as `jaxgran.fit` fits a measured one: the range over all alternatives is that to expect.
-    The median width of simulated experiments, which have noise, is .9 to 1.3 times the expected one
-    (``experiments/fit/plan.py``).
-    The same is done with each candidate, an addition to the experiment. The width of a range is
-    ``(high - low)/(true value)``. A plan at a wrong truth misleads: for the experiment as it is and
-    the best three candidates the width is found for up to five truths, too, in which A is smaller
-    and larger, what has a prior departs from it, and the gas contains an effect that the fit does
-    not know.
+    ``experiments/fit/plan.py`` compares it with the median width of simulated experiments, which
+    have noise. The same is done with each candidate, an addition to the experiment. The width of a
+    range is ``(high - low)/|true value|``. A plan at a wrong truth misleads: for the experiment as
+    it is and the best three candidates the width is found for up to five truths, too, in which A is
+    smaller and larger, what has a prior departs from it, and the gas contains an effect that the
+    fit does not know.
 
     Args:
         measurement: a curve with its errors, N and priors. With a curve by `jaxgran.cool`, which

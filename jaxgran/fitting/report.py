@@ -188,6 +188,8 @@ def _is_distinguishable(x: Alternative) -> str:
         return "preferred by the data"
     if x.distinguishable:
         return "yes"
+    if x.restitution is not None:
+        return "no"
     return f"no (needs {x.error_reduction_needed:.2g}x smaller errors)"
 
 

@@ -117,7 +117,7 @@ def test_a_question_comes_before_the_error_that_it_explains(measured, run, monke
     monkeypatch.setattr("jaxgran.fit", fail)  # which would take the largest number of steps
     status, _, err = run("fit", "steps.csv", "--quick")
     check, error = err.splitlines()[-2:]
-    assert status == 2 and "is it in steps or frames" in check and error == "error: no curve"
+    assert status == 2 and "is t counted in steps or frames" in check and error == "error: no curve"
 
 
 def test_a_single_curve_begins_with_the_range(measured, fit):

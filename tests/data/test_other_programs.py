@@ -368,7 +368,7 @@ def test_spins_and_sizes_of_a_trajectory(tmp_path):
 @pytest.mark.parametrize(
     "clock, scale, words",
     [
-        ("10{k}", 1.0, "T is T0 .* at t = .* and not at 0.*--free A t0"),
+        ("10{k}", 1.0, "T is T0 .* at t = .* not at t = 0.*--free A t0"),
         ("{k}", 1 / 9, "times the header's T0"),
     ],
 )

@@ -30,7 +30,10 @@ QUESTIONED = {
         text_of("t,T", (TIMES, 1e17 * T), T0=2e15),
         "T0 is 2e.15 m.2/s.2, .*kelvin times 1.38e-23 J/K over the mass",
     ),
-    "an error larger than its value": (text_of(nu_err=0.4), "nu_err is 0.4 .* more than nu, 0.3"),
+    "an error larger than its value": (
+        text_of(nu_err=0.4),
+        "nu_err is 0.4, larger than nu itself, 0.3",
+    ),
     "T/T0": (text_of("t,T", (TIMES, T / 0.02)), "is the column T over T0.*multiply it by 0.02"),
     "kelvin, untold": (
         text_of("t,T", (TIMES, T * float(GAS.mass) / 1.380649e-23)),
@@ -46,7 +49,7 @@ QUESTIONED = {
         text_of(diameter=3),
         "diameter is 3 m, .*mm.*diameter: 0.003",
     ),
-    "Y_err in Pa, Y in GPa": (text_of(Y="0.02 GPa", Y_err=1e6), "Y_err is 1e.15 Pa, more than Y"),
+    "Y_err in Pa, Y in GPa": (text_of(Y="0.02 GPa", Y_err=1e6), "Y_err is 1e.15 Pa, larger than Y"),
     "errors of other runs": (text_of(N=2e9), "T_err is at least .* larger .* N = 2e.09 particles"),
     "N of one": (text_of(N=1), "T_err is .* smaller .* N = 1 "),
 }

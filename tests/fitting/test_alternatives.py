@@ -106,7 +106,7 @@ DECISIVE = jaxgran.extend.Limitation("contacts last", True, "Take contacts.")
 CONSISTENT = " is consistent with this curve"
 AT_EDGE = ".* The scene is at the edge of the model's validity."
 NOT_EXPLAINED = " is not consistent with this curve: do not trust the estimates."
-UNTRUSTED = " cannot be trusted in this scene, though this curve fits."
+UNTRUSTED = " cannot be trusted in this scene, although the fit to this curve is good."
 VERDICTS = [
     # The clock is known to .5 %: no alternative changes A by more than its error.
     ((), 0.5, "determined", CONSISTENT + r", which determines A: A is between \S+ and \S+ s\."),
