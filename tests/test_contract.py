@@ -350,7 +350,7 @@ class TestContract:
             if (values := getattr(curve, name)) is not None:
                 assert float(values[0]) == 0
 
-    @of_models()
+    @of_models(slow=SPHERES)
     def test_energy_is_lost_and_accounted_for(self, case):
         curve, gas = case.base, case.gas
         inside = total_energy(gas, dataclasses.replace(curve, dissipated_energy=None))
@@ -429,7 +429,7 @@ class TestContract:
     @pytest.mark.parametrize(
         "change", [boosted, translated, permuted, rotated], ids=lambda change: change.__name__
     )
-    @of_models(has_positions)
+    @of_models(has_positions, slow=SPHERES)
     def test_frame_and_names_do_not_matter(self, case, change):
         start = change(case.start, case.gas)
         found = case.curve_and_slope(start=start)
@@ -508,7 +508,7 @@ class TestContract:
                 size = float(jnp.max(jnp.abs(difference)))
                 np.testing.assert_allclose(getattr(slope, name), difference, atol=1e-5 * size)
 
-    @of_models(is_stochastic)
+    @of_models(is_stochastic, slow=SPHERES)
     def test_projected_derivative_is_a_difference(self, case):
         h, off = 1e-3, []
         for key in jax.random.split(jax.random.key(3), 5):

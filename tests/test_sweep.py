@@ -124,6 +124,7 @@ def test_a_store_has_labels_and_units_for_xarray(store, store_of_saved):
     assert "units" not in found["saved.T"].attrs  # a user's function determines them
 
 
+@pytest.mark.slow
 def test_only_unfinished_chunks_are_computed(store_of_saved, tmp_path):
     zarr = pytest.importorskip("zarr")
     options = SAVED | {"store": tmp_path / "s.zarr"}

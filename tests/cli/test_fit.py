@@ -120,6 +120,7 @@ def test_a_question_comes_before_the_error_that_it_explains(measured, run, monke
     assert status == 2 and "is t counted in steps or frames" in check and error == "error: no curve"
 
 
+@pytest.mark.slow
 def test_a_single_curve_begins_with_the_range(measured, fit):
     text = (measured / "thin.csv").read_text()
     (measured / "thin.csv").write_text("# absent: walls\n" + text)

@@ -45,6 +45,7 @@ def test_impacts_have_the_speeds_and_the_law_of_the_spheres(filmed, tmp_path):
     assert result.p_value > 0.01
 
 
+@pytest.mark.slow
 def test_an_error_of_positions_that_is_not_given_is_found(filmed, tmp_path):
     found = impacts_of(filmed, 4e-5, tmp_path)
     assert found.localisation_error == pytest.approx(4e-5, rel=0.05)

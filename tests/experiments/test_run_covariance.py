@@ -8,8 +8,9 @@ import pytest
 from experiments.accuracy import run_covariance as runs
 
 STORED = np.load(runs.STORED)
+OFTEN = "hard spheres/smooth", "independent/walls .8"
 STORED_RUNS = [
-    pytest.param(name, marks=[pytest.mark.slow] if "rough" in name or "sliding" in name else [])
+    pytest.param(name, marks=() if name in OFTEN else pytest.mark.slow)
     for name in sorted({"/".join(name.split("/")[:2]) for name in STORED})
 ]
 

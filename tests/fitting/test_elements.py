@@ -67,6 +67,7 @@ def test_of_two_minima_in_beta_t_the_deeper_one_is_found_and_said_where_as_deep(
     assert any("another, equally good minimum" in reason for reason in result.reasons)
 
 
+@pytest.mark.slow
 def test_a_T_rot_that_theory_misses_as_a_whole_is_no_misfit():
     # Theory knows T_rot within 7 %: a common factor of 1.05 is within that, errors are 2 %.
     gas = rough_beads()

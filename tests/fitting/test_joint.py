@@ -64,6 +64,7 @@ def test_the_error_bar_of_few_impacts_whose_eps_scatters_holds(is_skewed):
     assert 88 <= held <= 99
 
 
+@pytest.mark.slow
 def test_eps_of_a_gas_scatters_as_that_of_its_impacts():
     gas = glass_beads(0.1)
     law = ViscoelasticVariant.from_law(gas.law)
@@ -173,6 +174,7 @@ def test_a_drop_test_may_come_first(order):
     assert result.names == (A, "wall_coefficient")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("second_diameter", "ratio"),
     [(1.0, 1.0), pytest.param(1.5, 0.5**0.5, id="other grains")],

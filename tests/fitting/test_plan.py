@@ -118,6 +118,7 @@ def test_a_plan_of_T_0_gives_its_range_with_a_second_density():
     assert second.gain > 0.5 and second.width < 2 * found.present.width
 
 
+@pytest.mark.slow
 def test_amplitudes_of_effects_do_not_depend_on_the_first_row():
     """The rate to which drag and walls refer is the rate at the start of the gas."""
     for times in (TIMES, np.linspace(3.0, 10.0, 8)):

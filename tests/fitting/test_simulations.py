@@ -213,6 +213,7 @@ def test_more_runs_make_it_quieter():
     assert np.all(noise < 0.8)  # 8 runs: .35
 
 
+@pytest.mark.slow
 def test_what_the_curve_does_not_tell_stays_where_it_was():
     with pytest.warns(UserWarning, match="A and T0"):
         found = fitted(StandIn(formula=of_sum), (0.3, 0.0), first=(0.1, 0.1))

@@ -28,6 +28,7 @@ REFERENCE = """
 HARD = KineticTheory(corrections=without("softness", "correlations"), order=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", REFERENCE.split("\n")[1:-1])
 @pytest.mark.figures
 def test_reference_table(row, record):

@@ -234,6 +234,7 @@ def test_a_sweep_looks_as_far_as_it_must():
         assert told == ahead and enough == count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("search", [pairs_by_sweep, pairs_by_cells])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_no_pair_just_within_the_cutoff_is_missed(dtype, search):

@@ -18,6 +18,7 @@ def constant(eps, dimension=3, **elements) -> jaxgran.Gas:
     return hard_gas(eps, 0.02, dimension, **SI, **elements)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dimension, spins", [(3, 3), (2, 1)])
 def test_perfectly_rough_elastic_spheres_keep_their_energy(dimension, spins):
     surface = jaxgran.Rough(1.0, rotational_temperature=2e-3)
