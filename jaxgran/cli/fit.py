@@ -34,6 +34,7 @@ from jaxgran.cli.scene import has_dissipation
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement_header import absent_of_header
 from jaxgran.fitting.goodness import SIGNIFICANCE
+from jaxgran.fitting.imitate import MIN_RUNS
 from jaxgran.fitting.report import parameter_rows, report
 from jaxgran.fitting.result import NOT_DETERMINED
 from jaxgran.models.choose import default_models
@@ -111,7 +112,7 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
         "fit_seconds": round(fit_seconds, 4),
     }
     outputs.record.parent.mkdir(parents=True, exist_ok=True)
-    has_picture = bool(paths) or len(measurements) > 1
+    has_picture = bool(paths)  # drop tests have no curve
     if has_picture:
         save_picture(result, title_of(files[0]), outputs.picture)
     details = details_of(result, chosen.reasons)
@@ -152,6 +153,14 @@ def _check_request(paths: Sequence[Path], options: FitOptions) -> None:
         raise ValueError(
             f"--model {options.model}: drop tests and several measurements are fitted with "
             f"{JOINT_MODEL}. Fit the curves one by one with other models."
+        )
+    if options.imitate and not is_single_curve:
+        raise ValueError(
+            "--imitate takes a fit of one curve. Imitate the curves one by one, or leave it out."
+        )
+    if options.imitate and options.imitate < MIN_RUNS:
+        raise ValueError(
+            f"--imitate {options.imitate}: give {MIN_RUNS} or more runs, or leave it out."
         )
     if options.impacts and not paths:
         raise ValueError(

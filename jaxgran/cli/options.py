@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter, Token
 
 from jaxgran._utils.validation import POSITIVE
-from jaxgran.data.files import name_in_errors
 from jaxgran.data.header_keys import OPTIONAL_KEYS, PRIOR_KEYS
-from jaxgran.data.header_lines import header_in_si
 from jaxgran.data.units import UNIT_KEYS
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.parameters import BY_SYMBOL
@@ -122,6 +120,4 @@ def parse_settings(pairs: Sequence[str]) -> dict[str, str]:
         if key in values:
             raise ValueError(f"--set gives {key} twice, {values[key]} and {value}: remove one")
         values[key] = value
-    with name_in_errors(Path("--set")):
-        header_in_si(values)
     return values

@@ -228,7 +228,10 @@ class DropTest(eqx.Module):
         return self._eps(gas, jnp.asarray(self.speed))
 
     def _eps(self, gas: Gas, speed: Array) -> Float[Array, "n"]:
-        law = gas.container.restitution if self.onto == WALL and gas.container else gas.law
+        law = gas.law
+        if self.onto == WALL:
+            assert gas.container is not None  # see check_gas
+            law = gas.container.restitution
         reduced = law.reduced if self.onto == SPHERE else law.on_wall
         known = reduced(diameter=gas.diameter, mass=gas.mass, speed=jnp.ones(()))
         return known.restitution(speed)

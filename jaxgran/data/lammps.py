@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from itertools import combinations_with_replacement
 
 import numpy as np
-from jaxtyping import ArrayLike
 
 from jaxgran._utils.validation import POSITIVE
 from jaxgran.scene.elements import Frictional, Rough, Walls
@@ -65,7 +64,7 @@ def lammps_commands(gas: Gas, diameters: Sequence[float] | None = None) -> str:
     masses = [float(gas.mass) * (x / float(gas.diameter)) ** 3 for x in sizes]
     lines = [
         "# F = k sqrt(R_eff) xi^(3/2) + eta m_eff sqrt(R_eff xi) dxi/dt, eta = (3/2) A k/m_eff;",
-        "# contacts end at F = 0 (limit_damping)",
+        "# contacts end at F = 0 (limit_damping)" if law.clipped else "# contacts end at xi = 0",
         "pair_style granular",
     ]
     for i, j in combinations_with_replacement(range(len(sizes)), 2):
@@ -78,25 +77,26 @@ def lammps_commands(gas: Gas, diameters: Sequence[float] | None = None) -> str:
     return "\n".join(lines)
 
 
-def contact_law(
-    law: Viscoelastic, reduced_mass: ArrayLike, friction: Frictional | Walls | None
-) -> str:
+def contact_law(law: Viscoelastic, reduced_mass: float, surface: Frictional | Walls | None) -> str:
     """Return the contact law of a pair, or of a sphere and a wall, in the words of LAMMPS.
 
     Args:
         law: of the material.
         reduced_mass: m_eff, kg.
-        friction: what has the tangential damping and the friction; None without.
+        surface: what has the tangential damping and the friction; None without.
     """
     k = float(2 * law.youngs_modulus / (3 * (1 - law.poisson_ratio**2)))
-    eta = 1.5 * float(law.dissipative_constant) * k / float(np.asarray(reduced_mass))
-    damping, coefficient = (
-        float(getattr(friction, name, None) or 0.0) for name in ("tangential_damping", "friction")
-    )
-    return (
+    eta = 1.5 * float(law.dissipative_constant) * k / reduced_mass
+    damping = coefficient = 0.0
+    if surface is not None and surface.friction is not None:
+        assert surface.tangential_damping is not None  # which walls with friction have
+        damping = float(surface.tangential_damping)
+        coefficient = float(surface.friction)
+    contact = (
         f"hertz {k!r} {eta!r} tangential linear_nohistory {damping!r} {coefficient!r} "
-        "damping viscoelastic limit_damping"
+        "damping viscoelastic"
     )
+    return f"{contact} limit_damping" if law.clipped else contact
 
 
 def _walls(gas: Gas, sizes: list[float]) -> list[str]:
@@ -114,7 +114,7 @@ def _walls(gas: Gas, sizes: list[float]) -> list[str]:
             f"wall/gran has one damping for all spheres, and {len(sizes)} sizes have different "
             "masses: give one diameter, or write a fix for the group of each size"
         )
-    of_wall = contact_law(law, gas.mass, walls)
+    of_wall = contact_law(law, float(gas.mass), walls)
     sides = np.broadcast_to(np.asarray(walls.side), (gas.dimension,))
     return [
         f"fix walls_{axis} all wall/gran granular {of_wall} {axis}plane 0 {float(side)!r}"

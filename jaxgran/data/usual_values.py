@@ -58,7 +58,7 @@ def ask_about_header(values: dict[str, float]) -> Iterator[str]:
 
 def ask_about_speeds(columns: dict[str, np.ndarray]) -> Iterator[str]:
     """Yield questions about unusual speeds among the columns of a drop test."""
-    for name in SPEEDS & columns.keys():
+    for name in sorted(SPEEDS & columns.keys()):
         largest = float(np.max(np.abs(columns[name])))
         if not is_usual(name, largest):
             yield unit_question(name, largest, "unit of a column")

@@ -30,6 +30,9 @@ from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.parameters import symbol_of
 
+MIN_RUNS = 2
+"""Smallest number of imitations."""
+
 TOLERANCE = 0.02
 """Relative error of T of the model that imitates."""
 
@@ -161,7 +164,7 @@ def imitate(
     'the range held the true'
     """
     check_bool(progress=progress)
-    runs = checked_int("runs", runs, 2)
+    runs = checked_int("runs", runs, MIN_RUNS)
     _check(result, runs)
     measurement = _at_the_estimate(result)
     key = checked_key(key)

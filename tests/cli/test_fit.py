@@ -95,6 +95,7 @@ def test_curves_with_one_floor_of_noise_are_misfits_not_contradictions(fit):
 def test_a_drop_test_stands_alone(fit):
     out, answer = fit("--drop-test", "alone.csv")
     assert_finds_A(answer)
+    assert ".png" not in out  # there is no curve to draw
     assert "drops    20 impacts" in out and answer["verdict"] == "determined"
 
 

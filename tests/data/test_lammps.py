@@ -33,7 +33,14 @@ def test_walls_and_friction_have_their_lines():
     lines = jaxgran.lammps_commands(WALLED).splitlines()
     walls = [line for line in lines if line.startswith("fix walls_")]
     assert [line.split()[-3] for line in walls] == ["xplane", "yplane", "zplane"]
-    assert contact_law(GAS.law, GAS.mass, None) in walls[0]
+    assert contact_law(GAS.law, float(GAS.mass), None) in walls[0]
+
+
+def test_contacts_end_at_no_force_or_at_no_overlap():
+    assert "limit_damping" in contact_law(GAS.law, 1e-5, None)
+    pulling = dataclasses.replace(GAS.law, clipped=False)
+    sticky = jaxgran.lammps_commands(dataclasses.replace(GAS, law=pulling))
+    assert "contacts end at xi = 0" in sticky and "limit_damping" not in sticky
 
 
 @pytest.mark.parametrize(
