@@ -54,3 +54,5 @@ def test_plan_prints_a_table_and_writes_it(scene, run):
     assert record["truth"] == 3e-6 and record["additions"][0]["gain"] > 1
     status, _, err = run("plan", "flight.toml", "--out", "plan.png")
     assert status == 2 and "exists. Name another --out" in err
+    status, _, err = run("plan", "flight.toml", "--out", "plan.html", "--report")
+    assert status == 2 and "must not end in .json or .html" in err

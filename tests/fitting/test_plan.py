@@ -158,6 +158,23 @@ def test_additions_are_combined_in_both_orders():
     )
 
 
+def test_combined_additions_keep_every_measurement():
+    def with_more_impacts(m):
+        return with_impacts(m) | {"impacts 2": with_impacts(m)["impacts"]}
+
+    found = candidates.combined(with_more_impacts, with_impacts, SMOOTH)
+    assert isinstance(found, dict)
+    assert [*found] == ["curve", "impacts", "impacts 2", "impacts 3"]
+
+
+def test_an_addition_to_no_curve_is_no_pair():
+    def without_errors(m):
+        curve = dataclasses.replace(m.curve, temperature_error=None)
+        return with_impacts(dataclasses.replace(m, data=curve))
+
+    assert candidates.combined(without_errors, candidates.with_smaller_errors, SMOOTH) is None
+
+
 @pytest.mark.slow
 def test_twin_is_the_curve_of_the_truth_with_the_relative_errors():
     truth = Truth(
