@@ -30,8 +30,8 @@ MIN_FALL_OF_STEP = 1e-4
 """A step hardly lowers -2 ln L if it lowers it by less than this, which may be round-off."""
 
 NEGLIGIBLE_STEP = 1e-4
-"""After a search one further Newton step is tried, unless it is shorter than this, in standard
-errors."""
+"""After a search a further Newton step is tried if it is longer than this, in standard errors, and
+shorter than `CONVERGED_STEP`."""
 
 FIRST_RADIUS = 1.0
 """Radius at first of the trust region, in the unconstrained parameters: a factor e of a positive
