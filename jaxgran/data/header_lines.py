@@ -109,7 +109,7 @@ def convert_header(header: dict[str, str], usual: dict[str, str], *, comma: bool
             continue  # a comment that begins with a number, as "2 cameras"
         plain = [plain_number(part.strip(), comma) for part in re.split("[x×]", text)]
         if any("," in number for number in plain):
-            continue  # no decimal comma: whoever reads this key refuses it
+            continue  # text: numbers have no decimal commas here
         factor = units.factor(key)
         if factor != 1:
             plain = [repr(factor * float(number)) for number in plain]
@@ -148,18 +148,20 @@ def _with_own_errors(header: dict[str, str]) -> dict[str, str]:
             raise ValueError(f"header line {key}: {text!r} gives {key}_err again; remove one")
         if error:
             if key in RELATIVE_ERRORS:
-                error = _as_part_of(value, error)
+                error = _as_part_of(key, value, error)
             split |= {key: value, f"{key}_err": error}
     return split
 
 
-def _as_part_of(value: str, error: str) -> str:
-    """Return an error as a part of its value; unchanged if it has a unit, as in per cent."""
+def _as_part_of(key: str, value: str, error: str) -> str:
+    """Return an error as a part of the value of a key; unchanged if it has a unit such as %."""
     numbers = [plain_number(text, comma=True) for text in (value, error)]
     if not all(map(NUMBER.fullmatch, numbers)):
         return error
-    value, error = numbers
-    return repr(float(error) / abs(float(value)))
+    of_value, of_error = map(float, numbers)
+    if of_value == 0:
+        raise ValueError(f"header line {key}: the value must not be 0, got {value}")
+    return repr(of_error / abs(of_value))
 
 
 def _value_and_error(text: str) -> tuple[str, str]:

@@ -60,6 +60,8 @@ def test_the_scale_of_T_is_a_known_key_whose_error_is_a_part_of_it(scale, write)
     measurement = read_measurement(write(text_of(T_scale=scale)))  # a warning would be an error
     assert measurement.calibration_error == approx(0.015)
     assert parse_settings([f"T_scale={scale}"]) == {"T_scale": scale}
+    with pytest.raises(ValueError, match="T_scale: the value must not be 0"):
+        header_in_si({"T_scale": "0 ± 0.03"})
 
 
 def test_frames_are_counted_per_second_whatever_the_unit_of_times():
