@@ -112,30 +112,19 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
         "fit_seconds": round(fit_seconds, 4),
     }
     outputs.record.parent.mkdir(parents=True, exist_ok=True)
-    has_picture = bool(paths)  # drop tests have no curve
-    if has_picture:
-        save_picture(result, title_of(files[0]), outputs.picture)
+    picture = outputs.picture if paths else None  # drop tests have no curve
+    if picture is not None:
+        save_picture(result, title_of(files[0]), picture)
     details = details_of(result, chosen.reasons)
     result.save(outputs.record, overwrite=options.overwrite, **summary, **details)
     print(report(result, explain=options.explain))
     for number, reason in enumerate(chosen.reasons):
         head = "chosen" if number == 0 else ""
         print(f"{head:9}- {reason}")
-    written = [outputs.picture, outputs.record] if has_picture else [outputs.record]
+    written = [outputs.record] if picture is None else [picture, outputs.record]
     if options.report:
-        first, *others = sections_of_fit(result, outputs.picture if has_picture else None)
-        plan = []
-        is_single_curve = has_picture and is_single(measurements)
-        if is_single_curve and result.grade == NOT_DETERMINED and not options.quick:
-            plan = what_to_measure_next(result)
-        write_page(
-            outputs.page,
-            title=", ".join(map(title_of, files)),
-            question=question_of("fit", result.names[0]),
-            answer=result.headline,
-            sections=[first, *plan, *others],
-            command=command_of("fit", files),
-        )
+        plan = [] if options.quick or picture is None else what_to_measure_next(result)
+        save_page(result, files, outputs.page, picture, plan)
         written.append(outputs.page)
     if options.imitate:
         imitation = jaxgran.imitate(result, options.imitate, key=jax.random.key(options.key))
@@ -409,8 +398,40 @@ def details_of(result: jaxgran.Fit, chosen: Sequence[str]) -> dict[str, Any]:
     )
 
 
+def save_page(
+    result: jaxgran.Fit,
+    files: Sequence[Path],
+    page: Path,
+    picture: Path | None,
+    plan: Sequence[Section],
+) -> None:
+    """Write the web page of a fit.
+
+    Args:
+        result: of the fit.
+        files: of its measurements.
+        page: the file.
+        picture: of the fit; None without one.
+        plan: part with a plan, which stands after the first part.
+    """
+    first, *others = sections_of_fit(result, picture)
+    write_page(
+        page,
+        title=", ".join(map(title_of, files)),
+        question=question_of("fit", result.names[0]),
+        answer=result.headline,
+        sections=[first, *plan, *others],
+        command=command_of("fit", files),
+    )
+
+
 def what_to_measure_next(result: jaxgran.Fit) -> list[Section]:
-    """Return the part of a page with a plan that starts at a fit; none if N is not known."""
+    """Return the part of a page with a plan that starts at a fit of one curve.
+
+    There is none if the curve determines the parameter, or if N is not known.
+    """
+    if not is_single(result.measurements) or result.grade != NOT_DETERMINED:
+        return []
     measurement = result.measurements[""]
     if measurement.num_particles is None:
         return []
