@@ -10,7 +10,7 @@ import platform
 import tempfile
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,8 +40,8 @@ from jaxgran.fitting.result import NOT_DETERMINED
 from jaxgran.models.choose import default_models
 from jaxgran.scene.parameters import BY_SYMBOL, SCENE
 
-JOINT_MODEL = "kinetic-theory"
-"""The only model of fits of drop tests and of several measurements: kinetic theory."""
+KINETIC_THEORY = "kinetic-theory"
+"""The only model of fits of drop tests and of several measurements."""
 
 
 class Outputs(NamedTuple):
@@ -112,29 +112,19 @@ def run_fit(paths: Sequence[Path], options: FitOptions, started: float) -> None:
         "fit_seconds": round(fit_seconds, 4),
     }
     outputs.record.parent.mkdir(parents=True, exist_ok=True)
-    has_picture = bool(paths)  # drop tests have no curve
-    if has_picture:
-        save_picture(result, title_of(files[0]), outputs.picture)
+    picture = outputs.picture if paths else None  # drop tests have no curve
+    if picture is not None:
+        save_picture(result, title_of(files[0]), picture)
     details = details_of(result, chosen.reasons)
     result.save(outputs.record, overwrite=options.overwrite, **summary, **details)
     print(report(result, explain=options.explain))
     for number, reason in enumerate(chosen.reasons):
         head = "chosen" if number == 0 else ""
         print(f"{head:9}- {reason}")
-    written = [outputs.picture, outputs.record] if has_picture else [outputs.record]
+    written = [outputs.record] if picture is None else [picture, outputs.record]
     if options.report:
-        sections = sections_of_fit(result, outputs.picture if has_picture else None)
-        is_single_curve = bool(paths) and _is_single(paths, options)
-        if is_single_curve and result.grade == NOT_DETERMINED and not options.quick:
-            sections[1:1] = what_to_measure_next(result)
-        write_page(
-            outputs.page,
-            title=", ".join(map(title_of, files)),
-            question=question_of("fit", result.names[0]),
-            answer=result.headline,
-            sections=sections,
-            command=command_of("fit", files),
-        )
+        plan = [] if options.quick or picture is None else what_to_measure_next(result)
+        save_page(result, files, outputs.page, picture, plan)
         written.append(outputs.page)
     if options.imitate:
         imitation = jaxgran.imitate(result, options.imitate, key=jax.random.key(options.key))
@@ -148,11 +138,11 @@ def _check_request(paths: Sequence[Path], options: FitOptions) -> None:
     resolved = [path.resolve() for path in (*paths, *options.drop_test)]
     if repeated := [str(path) for path in resolved if resolved.count(path) > 1]:
         raise ValueError(f"{repeated[0]} is given twice. Give each measurement once.")
-    is_single_curve = bool(paths) and _is_single(paths, options)
-    if not is_single_curve and options.model != JOINT_MODEL:
+    is_single_curve = bool(paths) and is_single(labels_of(paths, options))
+    if not is_single_curve and options.model != KINETIC_THEORY:
         raise ValueError(
             f"--model {options.model}: drop tests and several measurements are fitted with "
-            f"{JOINT_MODEL}. Fit the curves one by one with other models."
+            f"{KINETIC_THEORY}. Fit the curves one by one with other models."
         )
     if options.imitate and not is_single_curve:
         raise ValueError(
@@ -169,9 +159,24 @@ def _check_request(paths: Sequence[Path], options: FitOptions) -> None:
         )
 
 
-def _is_single(paths: Sequence[Path], options: FitOptions) -> bool:
-    """Tell whether one measurement is fitted, which then has the label ""."""
-    return len(paths) + len(options.drop_test) == 1 and not options.impacts
+def labels_of(paths: Sequence[Path], options: FitOptions) -> list[str]:
+    """Return the labels of the files of curves, then of the drop tests.
+
+    A label is the name of the file, or its path if a file before it has the same name. A single
+    measurement has the label "".
+    """
+    files = [*paths, *options.drop_test]
+    if len(files) == 1 and not options.impacts:
+        return [""]
+    labels: list[str] = []
+    for path in files:
+        labels.append(str(path) if path.stem in labels else path.stem)
+    return labels
+
+
+def is_single(labels: Iterable[str]) -> bool:
+    """Tell whether labels are those of a single measurement."""
+    return [*labels] == [""]
 
 
 def output_files(name: str, options: FitOptions) -> Outputs:
@@ -212,32 +217,24 @@ def read_all(paths: Sequence[Path], options: FitOptions) -> dict[str, jaxgran.Me
     given = parse_settings(options.set)
     if options.onto_plate and not options.drop_test:
         raise ValueError("--onto-plate belongs to --drop-test, which is not given.")
-    is_single = _is_single(paths, options)
+    labels = labels_of(paths, options)
     measurements: dict[str, jaxgran.Measurement] = {}
-    for path in paths:
+    for path, label in zip(paths, labels, strict=False):
         measurement = jaxgran.read_measurement(path, given)
         if isinstance(measurement.data, DropTest):
             raise ValueError(f"{path} is a drop test. Give it as --drop-test {path}.")
-        label = "" if is_single else _label(path, measurements)
-        measurements[label] = measurement
+        measurements[label] = with_absent(measurement, options.absent)
         if options.impacts:
             found = jaxgran.read_impacts(path, given).measurements
             measurements |= {f"{label} {name}": m for name, m in found.items()}
-        measurements[label] = with_absent(measurement, options.absent)
     of_drops = given | {"onto": "plate"} if options.onto_plate else given
     gas = next(iter(measurements.values())).gas if paths else None  # of the first curve
-    for path in options.drop_test:
+    for path, label in zip(options.drop_test, labels[len(paths) :], strict=True):
         measurement = jaxgran.read_measurement(path, of_drops, gas=gas)
         if not isinstance(measurement.data, DropTest):
             raise ValueError(f"{path} is a cooling curve. Give it without --drop-test.")
-        label = "" if is_single else _label(path, measurements)
         measurements[label] = with_absent(measurement, options.absent)
     return measurements
-
-
-def _label(path: Path, measurements: dict[str, jaxgran.Measurement]) -> str:
-    """Return the label of a file: its name, or its path if another file has this name."""
-    return str(path) if path.stem in measurements else path.stem
 
 
 def with_absent(measurement: jaxgran.Measurement, absent: Sequence[str]) -> jaxgran.Measurement:
@@ -255,10 +252,11 @@ def parameters_of(
     options: FitOptions, measurements: dict[str, jaxgran.Measurement]
 ) -> FreeParameters:
     """Return the free parameters of the fit."""
-    is_single = [*measurements] == [""]
-    free = options.free or (() if is_single else (_constant_of(measurements), "T0"))
+    free = options.free
+    if not free and not is_single(measurements):
+        free = (_constant_of(measurements), "T0")
     _check_constant(free, measurements)
-    if is_single:
+    if is_single(measurements):
         return FreeParameters(free or None)
     of_scene = tuple(key for key in free if BY_SYMBOL[key].belongs_to == SCENE)
     shared = tuple(key for key in free if key not in of_scene)
@@ -297,10 +295,10 @@ def choose_or_make_model(
     Args:
         options: of the command.
         path: of the curve, for a message.
-        measurements: one curve, unless the model is `JOINT_MODEL`.
+        measurements: one curve, unless the model is `KINETIC_THEORY`.
         parameters: of the fit.
     """
-    if options.model == JOINT_MODEL:
+    if options.model == KINETIC_THEORY:
         return ChosenModel(jaxgran.KineticTheory())
     (measurement,) = measurements.values()
     given = measurement.num_particles
@@ -331,11 +329,10 @@ def _fit_without_warnings(
     measurements: dict[str, jaxgran.Measurement], parameters: FreeParameters, **options: Any
 ) -> jaxgran.Fit:
     """Fit without warnings, which the report repeats."""
-    is_single = [*measurements] == [""]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         return jaxgran.fit(
-            measurements[""] if is_single else measurements,
+            measurements[""] if is_single(measurements) else measurements,
             free=parameters.free,
             separate=parameters.separate,
             **options,
@@ -350,7 +347,7 @@ def save_picture(result: jaxgran.Fit, name: str, picture: Path) -> None:
         name: of a single curve.
         picture: the file.
     """
-    if [*result.measurements] == [""]:
+    if is_single(result.measurements):
         plotting.save_fit(result, f"{name}: {result.headline}", picture)
         return
     curves = {
@@ -401,8 +398,40 @@ def details_of(result: jaxgran.Fit, chosen: Sequence[str]) -> dict[str, Any]:
     )
 
 
+def save_page(
+    result: jaxgran.Fit,
+    files: Sequence[Path],
+    page: Path,
+    picture: Path | None,
+    plan: Sequence[Section],
+) -> None:
+    """Write the web page of a fit.
+
+    Args:
+        result: of the fit.
+        files: of its measurements.
+        page: the file.
+        picture: of the fit; None without one.
+        plan: part with a plan, which stands after the first part.
+    """
+    first, *others = sections_of_fit(result, picture)
+    write_page(
+        page,
+        title=", ".join(map(title_of, files)),
+        question=question_of("fit", result.names[0]),
+        answer=result.headline,
+        sections=[first, *plan, *others],
+        command=command_of("fit", files),
+    )
+
+
 def what_to_measure_next(result: jaxgran.Fit) -> list[Section]:
-    """Return the part of a page with a plan that starts at a fit; none if N is not known."""
+    """Return the part of a page with a plan that starts at a fit of one curve.
+
+    There is none if the curve determines the parameter, or if N is not known.
+    """
+    if not is_single(result.measurements) or result.grade != NOT_DETERMINED:
+        return []
     measurement = result.measurements[""]
     if measurement.num_particles is None:
         return []

@@ -36,6 +36,7 @@ OF_MEASUREMENTS = (
     "T_from",
     "T_of",
     "tracked",
+    "T_scale",
     "T_scale_err",
     "errors",
     "T0_of",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter, Token
 
 from jaxgran._utils.validation import POSITIVE
-from jaxgran.data.header_keys import OPTIONAL_KEYS, PRIOR_KEYS
+from jaxgran.data.header_keys import ABSENT, OPTIONAL_KEYS, PRIOR_KEYS
 from jaxgran.data.units import UNIT_KEYS
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.parameters import BY_SYMBOL
@@ -40,9 +40,13 @@ WholeNumber = Annotated[int, Parameter(converter=_whole_number)]
 
 if TYPE_CHECKING:
     FreeParameter = str
+    Effect = str
 else:
     FreeParameter = Literal[tuple(symbol for symbol in BY_SYMBOL if symbol != "density")]
-"""Arguments of --free."""
+    """Arguments of --free."""
+
+    Effect = Literal[tuple(ABSENT)]
+    """Arguments of --absent."""
 
 
 @Parameter(name="*")
@@ -91,7 +95,7 @@ class FitOptions:
     set: Annotated[tuple[str, ...], Several] = ()
     out: Path | None = None
     overwrite: bool = False
-    absent: Annotated[tuple[str, ...], Several] = ()
+    absent: Annotated[tuple[Effect, ...], Several] = ()
     quick: bool = False
     imitate: WholeNumber = 0
     report: bool = False

@@ -12,7 +12,7 @@ from jaxgran.data.curve import MIN_POINTS, CoolingCurve, above_noise
 from jaxgran.data.definitions import facts_of, other_definitions
 from jaxgran.data.header_values import header_count, header_number
 from jaxgran.data.quantities import QUANTITIES
-from jaxgran.data.questions import ask
+from jaxgran.data.questions import ask, part
 from jaxgran.data.units import unit_in
 from jaxgran.data.usual_values import OTHER_UNITS, is_usual, unit_question
 from jaxgran.scene.gas import Gas
@@ -87,10 +87,13 @@ def _ask_about_errors(
     rows = above_noise(curve)
     share = np.asarray(curve.temperature_error)[rows] / np.asarray(curve.temperature)[rows]
     expected = sqrt(2 / (dimension * number * replicas))
-    ratios = {"larger": share[1:].min() / expected, "smaller": expected / share.max()}
-    for word, ratio in ratios.items():
-        if ratio > MAX_ERROR_RATIO:
-            yield ask("T_err and N", ratio=ratio, word=word, number=number, replicas=replicas)
+    too_large = share[1:].min() / expected
+    too_small = expected / share.max()
+    run = {"number": number, "replicas": replicas}
+    if too_large > MAX_ERROR_RATIO:
+        yield ask("T_err and N", comparison=part("larger", ratio=too_large), **run)
+    if too_small > MAX_ERROR_RATIO:
+        yield ask("T_err and N", comparison=part("smaller", ratio=too_small), **run)
 
 
 class _StartLine(NamedTuple):
@@ -169,11 +172,11 @@ def _ask_about_loss(line: _StartLine, gas: Gas) -> Iterator[str]:
     if USUAL_LOSS[0] <= loss <= USUAL_LOSS[1]:
         return
     units = [unit for unit in OTHER_UNITS["s"] if 1e-3 < loss / unit_in(unit, "s") < 1]
-    question = ask("any unit of the header")
+    question = part("any unit of the header")
     if units:
-        question = ask("unit of t", units=" or ".join(units), unit=units[0])
+        question = part("unit of t", units=" or ".join(units), unit=units[0])
     if loss < 1:
-        question += ask("steps")
+        question += part("steps")
     halving = line.halving_time / float(gas.mean_free_time)
     high, low = (halving * loss / usual for usual in USUAL_LOSS)
     yield ask("loss", halving=halving, low=low, high=high, question=question)
@@ -192,10 +195,10 @@ def _scale_question(ratio: float, gas: Gas, header: dict[str, str], column: str)
     T0 = float(gas.temperature)
     causes = []
     for definition, factor in other_definitions(ratio, column, facts_of(header)):
-        rename = ask("rename", column=definition.column) if definition.column else ""
+        rename = part("rename", column=definition.column) if definition.column else ""
         what = "it" if definition.power == 1 else "T"
         causes.append(
-            ask("definition", words=definition.words, rename=rename, what=what, factor=factor)
+            part("definition", words=definition.words, rename=rename, what=what, factor=factor)
         )
-    question = ". Or ".join(causes) or ask("any definition")
+    question = ". Or ".join(causes) or part("any definition")
     return ask("scale", first=ratio * T0, ratio=ratio, T0=T0, question=question)

@@ -49,12 +49,13 @@ def elements_of_header(header: dict[str, str]) -> dict[str, Any]:
 
 def _check_supported(header: dict[str, str]) -> None:
     """Raise ValueError for a key of an effect that no model has."""
-    for key, (neutral, reason) in UNSUPPORTED_KEYS.items():
+    for key, effect in UNSUPPORTED_KEYS.items():
+        neutral = effect.neutral
         if key in header and (neutral is None or header_number(header, key) != neutral):
             advice = "" if neutral is None else f" or set it to {neutral:g}"
             raise ValueError(
-                f"the header gives {key}: {reason}. No model of jaxgran supports it; fit a curve "
-                f"of equal spheres without it, and leave {key} out{advice}"
+                f"the header gives {key}: {effect.reason}. No model of jaxgran supports it; "
+                f"fit a curve of equal spheres without it, and leave {key} out{advice}"
             )
 
 

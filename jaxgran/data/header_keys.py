@@ -1,27 +1,33 @@
 """Keys of the header of a file: which are known, and what some of them stand for."""
 
+from typing import NamedTuple
+
 from jaxgran.scene.parameters import BY_SYMBOL
 
 TRACK_KEYS = ("box_side", "frame_rate", "timestep", "localisation_error")
 """Header keys of tracks and trajectories."""
 
-OPTIONAL_KEYS = (
+CURVE_KEYS = (
     "N",
-    "dimension",
     "replicas",
     "absent",
     "tracked",
     "T0_of",
+    "T_scale",
     "T_scale_err",
     "errors",
-    "onto",
-    "eps_scatters",
-    "spin_before",
     "T_from",
     "T_of",
     *TRACK_KEYS,
 )
-"""Further known header keys, neither of the gas nor of its elements."""
+"""Header keys that say how a cooling curve was measured. T is used as it is written: of T_scale,
+the factor by which it was multiplied, only the error counts."""
+
+DROP_TEST_KEYS = ("onto", "eps_scatters", "spin_before")
+"""Header keys of drop tests."""
+
+OPTIONAL_KEYS = ("dimension", *CURVE_KEYS, *DROP_TEST_KEYS)
+"""Known header keys that are not parameters of a gas."""
 
 PROVENANCE_KEYS = ("units", "points", "end_tau", "melt_tau", "steps_per_contact", "source")
 """Keys that document the origin of a curve, and that no result depends on."""
@@ -30,6 +36,7 @@ PRIOR_KEYS = {f"{symbol}_err": p.name for symbol, p in BY_SYMBOL.items() if symb
 """Header keys of standard errors, and the names of their priors in `jaxgran.fit`."""
 
 GUESS = "guess"
+"""Value of a header key for a parameter that is not known: a fit starts from `GUESSES`."""
 
 GUESSES = {
     "beta_t": 0.0,
@@ -38,7 +45,7 @@ GUESSES = {
     "wall_restitution": 1.0,
     "wall_beta_t": 0.0,
 }
-"""Header keys whose value may be "guess", and the values from which a fit then starts."""
+"""Header keys whose value may be `GUESS`, and the values from which a fit then starts."""
 
 ABSENT = {
     "walls": ("container_side", "wall_restitution"),
@@ -51,8 +58,18 @@ ABSENT = {
 VISCOELASTIC_KEYS = ("Y", "nu", "A")
 """Header keys of the law of viscoelastic spheres, which eps replaces."""
 
-ANY_GAS = {"eta": "0.1", "T0": "0.01"}
-"""Header keys that single impacts do not depend on."""
+
+class UnsupportedKey(NamedTuple):
+    """A header key of an effect that no model has.
+
+    Attributes:
+        neutral: the value that means "no effect"; None if every value means one.
+        reason: why no model has the effect.
+    """
+
+    neutral: float | None
+    reason: str
+
 
 _MIXTURE = (
     "grains of a mixture have a temperature for each kind, and one T is too few; diameters with a "
@@ -62,17 +79,21 @@ _MIXTURE = (
 _STICKING = "grains that stick lose all of their speed below some speed, and grow"
 
 UNSUPPORTED_KEYS = {
-    "gravity": (0.0, "under gravity density and T change with height, but gases are homogeneous"),
-    "polydispersity": (
+    "gravity": UnsupportedKey(
+        0.0, "under gravity density and T change with height, but gases are homogeneous"
+    ),
+    "polydispersity": UnsupportedKey(
         0.0,
         "grains of unequal masses have unequal temperatures, and sizes have the key diameter_sd, "
         "the standard deviation of the diameters in m",
     ),
-    "diameter_2": (None, _MIXTURE),
-    "density_2": (None, _MIXTURE),
-    "aspect_ratio": (1.0, "rods and ellipsoids collide at another rate and rotate"),
-    "cohesion": (0.0, _STICKING),
-    "surface_energy": (0.0, _STICKING),
-    "charge": (0.0, "charged grains are deflected without touching, but grains fly freely"),
+    "diameter_2": UnsupportedKey(None, _MIXTURE),
+    "density_2": UnsupportedKey(None, _MIXTURE),
+    "aspect_ratio": UnsupportedKey(1.0, "rods and ellipsoids collide at another rate and rotate"),
+    "cohesion": UnsupportedKey(0.0, _STICKING),
+    "surface_energy": UnsupportedKey(0.0, _STICKING),
+    "charge": UnsupportedKey(
+        0.0, "charged grains are deflected without touching, but grains fly freely"
+    ),
 }
-"""Keys of effects that no model has: the value that means "no effect" (or None), and the reason."""
+"""Keys of effects that no model has."""

@@ -23,6 +23,9 @@ COMMENT_SIGNS = "#%"
 BLANKS = ' "\t,;|'
 """Characters without meaning at both ends of a line."""
 
+RELATIVE_ERRORS = ("T_scale",)
+"""Header keys whose standard errors are parts of their values."""
+
 HEADER_LINE = "header line"
 """What a header key is called in messages."""
 
@@ -47,8 +50,8 @@ def header_in_si(header: dict[str, str]) -> dict[str, str]:
     >>> header_in_si({"diameter": "2 mm", "eta": "0.05"})
     {'diameter': '0.002', 'eta': '0.05'}
     """
-    header = with_usual_keys(header)
-    return convert_header(header, pop_units(header), comma=False)
+    entries, usual = split_units(with_usual_keys(header))
+    return convert_header(entries, usual, comma=False)
 
 
 def with_usual_keys(header: dict[str, str]) -> dict[str, str]:
@@ -56,17 +59,22 @@ def with_usual_keys(header: dict[str, str]) -> dict[str, str]:
     return {HEADER_ALIASES.get(key, key): value for key, value in header.items()}
 
 
-def pop_units(header: dict[str, str]) -> dict[str, str]:
-    """Remove the header keys of units; return the unit of numbers without one, by its SI unit."""
-    speed_given = "speed_unit" in header
-    given = {key: header.pop(key, unit) for key, unit in UNIT_KEYS.items()}
+def split_units(header: dict[str, str]) -> tuple[dict[str, str], dict[str, str]]:
+    """Return a header without its keys of units, and the unit of numbers without one.
+
+    The latter are by SI unit.
+
+    Raises:
+        ValueError: for a unit that is not known, or not one of the key.
+    """
+    given = {key: header.get(key, unit) for key, unit in UNIT_KEYS.items()}
     units = Units(given, {}, HEADER_LINE)
     for key in given:
         units.factor(key)  # raises for an unknown unit
     length = given["length_unit"]
     time = given["time_unit"]
-    speed = given["speed_unit"] if speed_given else f"{length}/{time}"
-    return {
+    speed = given["speed_unit"] if "speed_unit" in header else f"{length}/{time}"
+    usual = {
         "m": length,
         "m^2": f"{length}^2",
         "s": time,
@@ -76,6 +84,7 @@ def pop_units(header: dict[str, str]) -> dict[str, str]:
         "m^2/s": f"{length}^2/{time}",
         "m^2/s^3": f"({speed})^2/{time}",
     }
+    return {key: value for key, value in header.items() if key not in UNIT_KEYS}, usual
 
 
 def convert_header(header: dict[str, str], usual: dict[str, str], *, comma: bool) -> dict[str, str]:
@@ -83,7 +92,7 @@ def convert_header(header: dict[str, str], usual: dict[str, str], *, comma: bool
 
     Args:
         header: without keys of units.
-        usual: the unit of numbers without one, by SI unit: see `pop_units`.
+        usual: the unit of numbers without one, by SI unit: see `split_units`.
         comma: whether numbers may have decimal commas.
     """
     converted = _with_own_errors(header)
@@ -97,10 +106,10 @@ def convert_header(header: dict[str, str], usual: dict[str, str], *, comma: bool
     units = Units(given, usual, HEADER_LINE)
     for key, text in numbers.items():
         if given[key] and base_unit(key, HEADER_UNITS) is None:
-            continue
+            continue  # a comment that begins with a number, as "2 cameras"
         plain = [plain_number(part.strip(), comma) for part in re.split("[x×]", text)]
         if any("," in number for number in plain):
-            continue
+            continue  # text: numbers have no decimal commas here
         factor = units.factor(key)
         if factor != 1:
             plain = [repr(factor * float(number)) for number in plain]
@@ -115,7 +124,7 @@ def _absolute_errors(header: dict[str, str], units: Units) -> dict[str, str]:
         if base_unit(key, HEADER_UNITS) is None or not units.is_relative(key):
             continue
         value_key = key.removesuffix("_err")
-        if value_key == "T_scale":  # whose error is a part of it
+        if value_key in RELATIVE_ERRORS:
             continue
         if value_key not in header:
             raise ValueError(
@@ -138,18 +147,21 @@ def _with_own_errors(header: dict[str, str]) -> dict[str, str]:
         if error and f"{key}_err" in header:
             raise ValueError(f"header line {key}: {text!r} gives {key}_err again; remove one")
         if error:
+            if key in RELATIVE_ERRORS:
+                error = _as_part_of(key, value, error)
             split |= {key: value, f"{key}_err": error}
-    if "T_scale" in split and "T_scale_err" not in header:
-        split |= _relative_error_of_scale(split)
     return split
 
 
-def _relative_error_of_scale(header: dict[str, str]) -> dict[str, str]:
-    """Return the error behind T_scale as `T_scale_err`, which is a part of it."""
-    error = header.get("T_scale_err", "")
-    if not (NUMBER.fullmatch(error) and NUMBER.fullmatch(header["T_scale"])):
-        return {}
-    return {"T_scale_err": repr(float(error) / abs(float(header["T_scale"])))}
+def _as_part_of(key: str, value: str, error: str) -> str:
+    """Return an error as a part of the value of a key; unchanged if it has a unit such as %."""
+    numbers = [plain_number(text, comma=True) for text in (value, error)]
+    if not all(map(NUMBER.fullmatch, numbers)):
+        return error
+    of_value, of_error = map(float, numbers)
+    if of_value == 0:
+        raise ValueError(f"header line {key}: the value must not be 0, got {value}")
+    return repr(of_error / abs(of_value))
 
 
 def _value_and_error(text: str) -> tuple[str, str]:
@@ -159,11 +171,21 @@ def _value_and_error(text: str) -> tuple[str, str]:
     >>> _value_and_error("3.00(5) mm"), _value_and_error("0.04 +- 5 %")
     (('3.00 mm', '0.05 mm'), ('0.04', '5 %'))
     """
-    if digits := DIGITS_IN_BRACKETS.fullmatch(text):
-        number, error, exponent, unit = digits.groups()
-        decimals = len(re.split("[.,]", number)[1]) if re.search("[.,]", number) else 0
-        error = f"{int(error) * 10.0**-decimals:.{decimals}f}"
-        return f"{number}{exponent}{unit}", f"{error}{exponent}{unit}"
+    match = DIGITS_IN_BRACKETS.fullmatch(text)
+    if match is None:
+        return _around_plus_minus(text)
+    return _with_last_digits(*match.groups())
+
+
+def _with_last_digits(number: str, error: str, exponent: str, unit: str) -> tuple[str, str]:
+    """Return value and error of a number and the error of its last digits."""
+    decimals = len(re.split("[.,]", number)[1]) if re.search("[.,]", number) else 0
+    error = f"{int(error) * 10.0**-decimals:.{decimals}f}"
+    return f"{number}{exponent}{unit}", f"{error}{exponent}{unit}"
+
+
+def _around_plus_minus(text: str) -> tuple[str, str]:
+    """Return the value and the error around a sign ±, both of which may be in brackets."""
     behind = ""
     if (bracketed := _BRACKETED.fullmatch(text)) and PLUS_MINUS.search(bracketed[1]):
         text = bracketed[1].strip()
@@ -180,7 +202,11 @@ def _value_and_error(text: str) -> tuple[str, str]:
 
 
 def add_header_line(header: dict[str, str], i: int, line: str) -> None:
-    """Add line i if it is an entry; skip other comments, and sentences that begin alike."""
+    """Add line i to a header if it is an entry; skip other comments.
+
+    Raise for a key that is given twice; skip a comment of several words before the colon that was
+    read before.
+    """
     key, value = header_entry(line) or ("", "")
     key = HEADER_ALIASES.get(key, key)
     if key and key not in header:
@@ -198,10 +224,14 @@ def header_entry(line: str) -> tuple[str, str] | None:
         return None
     key, mark, value = (part.strip() for part in match.groups())
     name = NAME.fullmatch(key)
-    if name is not None and base_unit(name["name"], HEADER_UNITS) is not None:
-        unit = name["bracket"] or name["slash"]
-        return name["name"], f"{value} {unit}" if unit else value
-    return None if mark == "=" and name is None else (key, value)
+    if name is None:
+        return None if mark == "=" else (key, value)
+    if base_unit(name["name"], HEADER_UNITS) is None:
+        return key, value
+    unit = name["bracket"] or name["slash"]
+    if unit:
+        value = f"{value} {unit}"
+    return name["name"], value
 
 
 def text_of_comment(line: str) -> str:

@@ -13,10 +13,12 @@ from jaxgran.data.header import (
     gas_of_header,
     missing_keys,
 )
-from jaxgran.data.header_keys import ANY_GAS
 from jaxgran.data.measurement import Measurement
 from jaxgran.data.measurement_header import arguments_of_header
 from jaxgran.scene.gas import Gas
+
+OF_NO_IMPACT = {"eta": "0.1", "T0": "0.01"}
+"""Header entries that single impacts do not depend on, for drop tests without them."""
 
 
 def read_measurement(
@@ -53,7 +55,8 @@ def read_measurement(
             entries with the same key. Keys: see `jaxgran.data.header.gas_of_header` and
             `jaxgran.data.measurement_header.priors_of_header`, N, replicas, absent, tracked,
             T0_of ("run" or "ensemble"), T_scale_err, errors ("measured"), which stand for the
-            arguments of `Measurement`, those of drop tests, onto ("sphere", "plate" or "wall"),
+            arguments of `Measurement`, T_scale, a factor that T already contains, with its error
+            behind it, those of drop tests, onto ("sphere", "plate" or "wall"),
             eps_scatters ("yes") and spin_before ("0"), and the keys of tracks.
         gas: the gas in place of the header's, such as the gas of a curve for a drop test.
 
@@ -77,7 +80,7 @@ def read_measurement(
         entries = content.header
         questions = content.questions
         if isinstance(content.data, DropTest) and gas is None:
-            entries = ANY_GAS | entries
+            entries = OF_NO_IMPACT | entries
             if missing := missing_keys(entries):
                 raise ValueError(
                     f"the header of this drop test lacks {', '.join(missing)}: add them, or give "

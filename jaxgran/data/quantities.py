@@ -24,20 +24,24 @@ class Quantity(NamedTuple):
     def error(self) -> "Quantity":
         """The standard error of this quantity."""
         label = f"standard error of {self.label}"
-        return Quantity(f"{self.field}_error", f"{self.column}_err", self.unit, label, True)
+        return Quantity(
+            f"{self.field}_error", f"{self.column}_err", self.unit, label, measured=True
+        )
 
 
 WITH_ERRORS = (
-    Quantity("temperature", "T", "m^2/s^2", "temperature <v^2>/d", True),
-    Quantity("displacement", "msd", "m^2", "mean square displacement", True),
-    Quantity("rotational_temperature", "T_rot", "m^2/s^2", "T_rot = I <w^2>/(d_rot m)", True),
+    Quantity("temperature", "T", "m^2/s^2", "temperature <v^2>/d", measured=True),
+    Quantity("displacement", "msd", "m^2", "mean square displacement", measured=True),
+    Quantity(
+        "rotational_temperature", "T_rot", "m^2/s^2", "T_rot = I <w^2>/(d_rot m)", measured=True
+    ),
 )
 """Quantities that have standard errors."""
 
 QUANTITIES = {
     quantity.field: quantity
     for quantity in (
-        Quantity("times", "t", "s", "time", True),
+        Quantity("times", "t", "s", "time", measured=True),
         *(part for measured in WITH_ERRORS for part in (measured, measured.error)),
         Quantity("sonine", "a2", "1", "second Sonine coefficient"),
         Quantity("third_sonine", "a3", "1", "third Sonine coefficient"),

@@ -32,7 +32,3 @@ class Run(NamedTuple):
     save: Callable[..., Any] | str | None = None
     trajectory: str | Path | None = None
     starts: dict[str, Any] | None = None
-
-
-DEFAULTS = Run()
-"""A silent run with the default random numbers, which saves nothing."""

@@ -22,7 +22,7 @@ from jaxgran.data.header_lines import (
     COMMENT_SIGNS,
     add_header_line,
     convert_header,
-    pop_units,
+    split_units,
     text_of_comment,
     with_usual_keys,
 )
@@ -140,8 +140,7 @@ def read_table(
         OSError: if the file cannot be read.
     """
     lines = _lines_of_text(read_text(path, wanted), wanted)
-    header = lines.header | with_usual_keys(given)
-    usual = pop_units(header)
+    header, usual = split_units(lines.header | with_usual_keys(given))
     units_of_rows, rows = _split_head_rows(lines.rows)
     names: list[str] = []
     units_given: dict[str, str] = {}

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jaxgran.data.questions import ask
+from jaxgran.data.questions import ask, part
 from jaxgran.data.units import UNITS, unit_in
 
 SPEEDS = {"v", "v_n", "v_t", "vx", "vy", "vz"}
@@ -52,8 +52,13 @@ def ask_about_header(values: dict[str, float]) -> Iterator[str]:
             yield ask("T0 is 1")
         if key != "t0" and error > value > 0:
             unit = UNITS[key]
-            name = "large error of a number" if unit == "1" else "large error"
-            yield ask(name, key=key, error=error, unit=unit, value=value)
+            yield ask(
+                "large error of a number" if unit == "1" else "large error",
+                key=key,
+                error=error,
+                unit=unit,
+                value=value,
+            )
 
 
 def ask_about_speeds(columns: dict[str, np.ndarray]) -> Iterator[str]:
@@ -70,15 +75,15 @@ def unit_question(name: str, value: float, advice: str) -> str:
     Args:
         name: of a header key or a column.
         value: in SI.
-        advice: the name in `QUESTIONS` of what to write if such a unit is found.
+        advice: the name in `PARTS` of what to write if such a unit is found.
     """
     low, high = USUAL_RANGES[name]
     base = UNITS[name]
-    question = ask("any unit of T" if base == "m^2/s^2" else "any unit")
+    question = part("any unit of T" if base == "m^2/s^2" else "any unit")
     for unit in OTHER_UNITS[base]:
         in_si = unit_in(unit, base) * value
         if is_usual(name, in_si):
-            question = ask(advice, name=name, unit=unit, value=value, in_si=in_si)
+            question = part(advice, name=name, unit=unit, value=value, in_si=in_si)
             break
     return ask("unusual", name=name, value=value, base=base, low=low, high=high, question=question)
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from jaxgran._utils.tracing import fast_jit
 from jaxgran.fitting.innovations import Innovations, Nodes, filtered, innovations
 from jaxgran.fitting.parameters import with_parameters
-from jaxgran.fitting.prediction import Element, PredictedCurve, Prediction
+from jaxgran.fitting.prediction import Element, PredictedCurve, Prediction, diffusive_share
 from jaxgran.fitting.rows import DISPLACEMENT, Displacement, Noise, Observed
 from jaxgran.scene.gas import Gas
 
@@ -216,17 +216,16 @@ def _elements_that_change_temperatures(curve: PredictedCurve) -> list[tuple[Elem
 def _displacement_residuals(curve: PredictedCurve, measured: Displacement, size: int) -> Residuals:
     """Return the residuals of <dr^2>."""
     collisions = curve.prediction.collisions[curve.place]
-    # The common factor is one of D: the ballistic flight before collisions has no error.
-    diffusive = collisions / (1 + collisions)
+    share = diffusive_share(collisions)
     factor = curve.values.get(DISPLACEMENT, 0.0)
-    computed = curve.prediction.displacement[curve.place] + factor * diffusive
+    computed = curve.prediction.displacement[curve.place] + factor * share
     used = measured.used
     values = measured.whitening @ np.where(used, measured.logs - computed, 0.0)
     slopes = np.zeros((values.size, size))
     for element, tangent in zip(curve.elements, curve.tangents, strict=True):
         change = tangent.displacement[curve.place]
         if element.name == DISPLACEMENT:
-            change = diffusive * element.slope
+            change = share * element.slope
         slopes[:, element.place] = -measured.whitening @ np.where(used, change, 0.0)
     return Residuals(
         name="displacement",

@@ -3,7 +3,7 @@
 The rules here choose messages and their values; `jaxgran.fitting.messages` has the words.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -25,7 +25,9 @@ from jaxgran.fitting.result import (
     Fit,
     by_label,
 )
-from jaxgran.models.base import Limitation
+from jaxgran.fitting.setup import Request
+from jaxgran.models.base import AbstractModel, Limitation
+from jaxgran.models.checks import describe_walls
 from jaxgran.scene.parameters import symbol_of, unit_of
 
 RISING_SIGNIFICANCE = 0.05
@@ -95,27 +97,25 @@ class _Misfit(NamedTuple):
 
 
 def with_conclusions(
+    request: Request,
     result: Fit,
     explanations: Explanations | None,
-    limitations: tuple[Limitation, ...],
-    notes: list[str],
-    *,
-    quick: bool,
+    notes: Sequence[str | Message],
     measurement_share: float,
 ) -> Fit:
     """Return a fit with its first line, grade, verdict and reasons.
 
     Args:
+        request: of the user.
         result: a fit whose numbers are complete.
         explanations: the fitted law and its alternatives; None if they were not compared.
-        limitations: of the model in the scenes.
         notes: further reasons.
-        quick: whether the user did not want the alternatives.
-        measurement_share: share of the errors of the measurement in the variances of T.
+        measurement_share: share of the errors of the measurement in the variances of T, see
+            `jaxgran.fitting.goodness.measurement_share`.
     """
-    decisive_first = sorted(limitations, key=lambda limitation: not limitation.decisive)
+    limitations = _limitations(request.model, result)
     misfit = _misfit(result, measurement_share)
-    verdict = _verdict(result, misfit, decisive_first)
+    verdict = _verdict(result, misfit, limitations)
     reasons = [
         _chi2(result),
         *misfit.rising,
@@ -123,12 +123,13 @@ def with_conclusions(
         *_scatter(result),
         *_errors_of_T(result),
         *_parts_of_measurements(result),
-        _assumptions(result),
+        _assumptions(request.model, result),
         *_absent_effects(result),
-        *_limits_of_comparison(result, quick=quick),
+        *_limits_of_comparison(request, result),
         *_alternatives(result),
         *notes,
-        *(limitation.words for limitation in decisive_first),
+        *_surroundings(result),
+        *(limitation.words for limitation in limitations),
         *_convergence(result),
         *describe_search(result),
     ]
@@ -168,8 +169,7 @@ def _first_parameter(result: Fit) -> Message:
     if name not in result.ranges:
         return Message("estimate alone", **values)
     low, high = _ends(result)
-    is_wide = low < NEGLIGIBLE_SHARE * abs(estimate) or high > MAX_RATIO * low
-    if not low <= estimate <= high or (low >= 0 and is_wide):
+    if not low <= estimate <= high or _is_wide(low, high, estimate):
         return Message("range alone", range=_range(result, low, high))
     return Message("estimate and range", low=low, high=high, **values)
 
@@ -183,6 +183,11 @@ def _ends(result: Fit) -> tuple[float, float]:
     """Return the low and the high end of the range of the first parameter."""
     low, high = result.ranges[result.names[0]]
     return float(low[0]), float(high[0])
+
+
+def _is_wide(low: float, high: float, estimate: float) -> bool:
+    """Tell whether the range of a positive parameter is too wide for an estimate to be given."""
+    return low >= 0 and (low < NEGLIGIBLE_SHARE * abs(estimate) or high > MAX_RATIO * low)
 
 
 def _range(result: Fit, low: float, high: float) -> Message:
@@ -245,6 +250,18 @@ def _rising(result: Fit) -> Iterator[Message]:
         trend = scipy.stats.kendalltau(np.arange(T.size), T, alternative="greater")
         if m.data.temperature_error is None and trend.pvalue < RISING_SIGNIFICANCE:
             yield Message("rising", first=T[0], last=T[-1])
+
+
+def _limitations(model: AbstractModel, result: Fit) -> list[Limitation]:
+    """Return the limitations of a model in the fitted gases, the decisive ones first."""
+    gases = by_label(result.gas)
+    by_words: dict[str, Limitation] = {}
+    for label, m in result.measurements.items():
+        if isinstance(m.data, DropTest):
+            continue
+        for limitation in model.limitations(gases[label], m.num_particles):
+            by_words.setdefault(limitation.words, limitation)
+    return sorted(by_words.values(), key=lambda limitation: not limitation.decisive)
 
 
 def _verdict(result: Fit, misfit: _Misfit, limitations: list[Limitation]) -> Message:
@@ -409,54 +426,67 @@ def _parts_of_measurements(result: Fit) -> Iterator[Message]:
         )
 
 
-def _assumptions(result: Fit) -> Message:
-    """Return what the model assumes of the measured gases."""
-
-    def spheres(m: Measurement) -> str:
-        return next((element for element in SPHERES if element in m.gas.elements), "")
-
+def _assumptions(model: AbstractModel, result: Fit) -> Message:
+    """Return what a model assumes of the measured gases."""
+    measurements = result.measurements
+    spheres = {label: _element_of_spheres(m) for label, m in measurements.items()}
     assumed = []
-    for element in dict.fromkeys(map(spheres, result.measurements.values())):
-        assumed += _in_curves(result, SPHERES[element], lambda m, x=element: spheres(m) == x)
-    assumed += _in_curves(result, Message("far from walls"), lambda m: m.gas.container is None)
-    assumed += _in_curves(result, Message("in vacuum"), lambda m: m.gas.drag is None)
-    if not getattr(result.model, "has_positions", False):
+    for element in dict.fromkeys(spheres.values()):
+        labels = [label for label, x in spheres.items() if x == element]
+        assumed += _in_curves(result, SPHERES[element], labels)
+    without_walls = [label for label, m in measurements.items() if m.gas.container is None]
+    assumed += _in_curves(result, Message("far from walls"), without_walls)
+    without_drag = [label for label, m in measurements.items() if m.gas.drag is None]
+    assumed += _in_curves(result, Message("in vacuum"), without_drag)
+    if not model.has_positions:
         assumed.append(Message("homogeneous"))
     return Message("assumptions", all=listed("names", assumed))
 
 
+def _element_of_spheres(m: Measurement) -> str:
+    """Return the first element of `SPHERES` that a gas has; "" for equal, smooth spheres."""
+    return next((element for element in SPHERES if element in m.gas.elements), "")
+
+
 def _absent_effects(result: Fit) -> Iterator[Message]:
     """Yield the effects that are known to be absent, with the curves if not in all of them."""
-    effects = dict.fromkeys(x for m in result.measurements.values() for x in m.absent)
+    measurements = result.measurements
     absent = []
-    for effect in effects:
-        absent += _in_curves(result, effect, lambda m, x=effect: x in m.absent)
+    for effect in dict.fromkeys(x for m in measurements.values() for x in m.absent):
+        labels = [label for label, m in measurements.items() if effect in m.absent]
+        absent += _in_curves(result, effect, labels)
     if absent:
         yield Message("absent", names=listed("names", absent))
 
 
 def _in_curves(
-    result: Fit, what: str | Message, holds: Callable[[Measurement], bool]
+    result: Fit, what: str | Message, labels: Collection[str]
 ) -> Iterator[str | Message]:
     """Yield what holds for all curves, or for those that are then named; nothing for none.
 
     In a fit of drop tests alone these take the place of curves.
+
+    Args:
+        result: of the fit.
+        what: the statement.
+        labels: of the measurements for which it holds.
     """
-    of_curves = {k: m for k, m in result.measurements.items() if not isinstance(m.data, DropTest)}
-    curves = of_curves or result.measurements
-    labels = [label for label, m in curves.items() if holds(m)]
-    if labels:
-        in_all = len(labels) == len(curves)
-        yield what if in_all else Message("in some", what=what, labels=listed("names", labels))
+    every = result.measurements
+    curves = [x for x, m in every.items() if not isinstance(m.data, DropTest)] or [*every]
+    among = [label for label in curves if label in labels]
+    if among == curves:
+        yield what
+    elif among:
+        yield Message("in some", what=what, labels=listed("names", among))
 
 
-def _limits_of_comparison(result: Fit, *, quick: bool) -> Iterator[Message]:
+def _limits_of_comparison(request: Request, result: Fit) -> Iterator[Message]:
     """Yield why alternatives were not compared, or not by the model."""
-    if quick:
+    if request.quick:
         yield Message("quick")
-    if any(m.gas.drive is not None for m in result.measurements.values()):
+    if any(m.gas.drive is not None for m in request.measurements.values()):
         yield Message("driven")
-    if result.model is not None and result.model.stochastic and result.alternatives:
+    if request.model.stochastic and result.alternatives:
         yield Message("of particles")
 
 
@@ -482,6 +512,20 @@ def _alternatives(result: Fit) -> Iterator[Message]:
             yield Message("law is possible" if is_law else "is possible", **values)
 
 
+def _surroundings(result: Fit) -> Iterator[Message]:
+    """Yield for each curve what its walls, or the box of its grains, may mean."""
+    gases = by_label(result.gas)
+    for label, m in result.measurements.items():
+        if isinstance(m.data, DropTest):
+            continue
+        gas = gases[label]
+        N = m.num_particles
+        if gas.container is not None:
+            yield Message("gravity")
+        elif N is not None and "walls" not in m.absent:
+            yield Message("box", of=label, number=N, walls=describe_walls(gas, N))
+
+
 def _convergence(result: Fit) -> Iterator[Message]:
     """Yield whether the search did not converge, and the noise of simulations."""
     if not result.converged:
@@ -493,9 +537,12 @@ def _convergence(result: Fit) -> Iterator[Message]:
 
 
 def describe_search(result: Fit) -> Iterator[Message]:
-    """Yield few particles, undetermined parameters and equally good minima: also warnings."""
-    number = getattr(result.model, "num_particles", MIN_PARTICLES)
-    if number < MIN_PARTICLES:
+    """Yield few particles, undetermined parameters and equally good minima.
+
+    `jaxgran.fit` also gives them as warnings.
+    """
+    number = getattr(result.model, "num_particles", None)
+    if number is not None and number < MIN_PARTICLES:
         yield Message("few particles", number=number, least=MIN_PARTICLES)
     if group := result.undetermined:
         why = _why_undetermined(group)

@@ -1,6 +1,5 @@
-"""The estimate of a fit and its result."""
+"""A fit of a model without noise: searches, tests, and the `Fit` made of them."""
 
-from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -9,7 +8,6 @@ import numpy as np
 from jaxgran._utils import status
 from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.data.curve import CoolingCurve, above_noise
-from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.alternatives import Explanations, compare_alternatives
 from jaxgran.fitting.conclusions import with_conclusions
@@ -30,12 +28,10 @@ from jaxgran.fitting.parameters import as_floats, with_parameters
 from jaxgran.fitting.prediction import TINY
 from jaxgran.fitting.problem import Evaluation, Problem, unknown_of
 from jaxgran.fitting.profiles import ALLOWED
-from jaxgran.fitting.result import Fit, by_label
+from jaxgran.fitting.result import Fit
 from jaxgran.fitting.rows import SCATTER, WHITE, CurveRows, has_no_measured_errors
 from jaxgran.fitting.search import Minimum, deepest, minima_from_starts, minimise
 from jaxgran.fitting.setup import Request, build_problem, problem_with_rate_errors
-from jaxgran.models.base import Limitation
-from jaxgran.models.checks import describe_walls
 from jaxgran.models.scales import scales_at
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.parameters import symbol_of
@@ -44,7 +40,7 @@ ERROR_LIMITS = (1e-4, 1.0)
 """Range of the first guess of the relative standard deviation of independent errors of T. A curve
 of less than three points gives the lower end."""
 
-MAX_DISTANCE = 3.0
+DISTANT_FACTOR = 3.0
 """Factor between measured and fitted T. If `DISTANT_SHARE` of the values differ by more, the scale
 of T or of time is wrong."""
 
@@ -78,33 +74,29 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
         max_steps: of each search.
         descent: a gradient descent in place of Newton's method; None for the latter.
     """
-    problem, first, notes = build_problem(request)
+    problem, first, notes_on_data = build_problem(request)
     problem.check_points()
-    without_errors = _search(problem, first, max_steps, descent)
-    end = without_errors
-    # Errors of T that the fit adds would explain any misfit: it is judged without them.
-    quality = goodness(end.problem, end.evaluate())
-    is_explained = end.best.converged and quality["p_value"] >= SIGNIFICANCE
-    if descent is None and not is_explained:
-        end = _with_errors_of_T(without_errors, first, max_steps)
-        if not without_errors.best.converged:
-            found = without_errors.problem.evaluate(end.best.flat[: first.size])
-            quality = goodness(without_errors.problem, found)
+    plain = _search(problem, first, max_steps, descent)
+    end = plain
+    if descent is None and not _is_explained(plain):
+        end = _with_errors_of_T(plain, first, max_steps)
+    quality = _quality_without_errors(plain, end)
     found = end.evaluate()
-    distant = distant_curves(end.problem, found)
+    distant = _distant_curves(end.problem, found)
     explanations = None
     if end.best.converged and not (request.quick or distant):
         noise = np.zeros(problem.num_free)
         explanations = compare_alternatives(end.problem, end.minima, noise)
     result = _result(request, end, explanations, quality)
+    notes: list[str | Message] = [*notes_on_data]
     if distant:
-        notes.append(str(Message("distant", ratio=MAX_DISTANCE)))
+        notes.append(Message("distant", ratio=DISTANT_FACTOR))
     elif result.p_value < SIGNIFICANCE and not request.quick:
-        notes += _outlier_notes(without_errors.problem, first, max_steps)
+        notes += _outlier_notes(plain.problem, first, max_steps)
     if found.scatter_of_eps is not None:
-        notes.append(str(Message("scatter of eps", scatter=found.scatter_of_eps)))
+        notes.append(Message("scatter of eps", scatter=found.scatter_of_eps))
     share = measurement_share(end.problem, found)
-    return with_messages(request, result, explanations, notes, share)
+    return with_conclusions(request, result, explanations, notes, share)
 
 
 def _search(problem: Problem, first: np.ndarray, max_steps: int, descent: Descent | None) -> _End:
@@ -114,7 +106,7 @@ def _search(problem: Problem, first: np.ndarray, max_steps: int, descent: Descen
     else:  # it keeps the errors of the cooling rate that it began with
         minima = minima_from_starts(problem, first, max_steps, descent)
         end = _End(problem, deepest(minima), minima)
-    check_computed(end.problem, end.best)
+    _check_computed(end.problem, end.best)
     return end
 
 
@@ -127,7 +119,7 @@ def _found_by_two_searches(problem: Problem, first: np.ndarray, max_steps: int) 
     held, is_left = problem.holding(SCATTER)
     minima = minima_from_starts(held, first[is_left], max_steps)
     begun = deepest(minima)
-    check_computed(held, begun)
+    _check_computed(held, begun)
 
     def whole(flat: np.ndarray) -> np.ndarray:
         full = first.copy()
@@ -161,6 +153,28 @@ def _with_errors_of_T(end: _End, first: np.ndarray, max_steps: int) -> _End:
     return found
 
 
+def _is_explained(end: _End) -> bool:
+    """Tell whether a search converged at values that are consistent with the data."""
+    if not end.best.converged:
+        return False
+    return goodness(end.problem, end.evaluate())["p_value"] >= SIGNIFICANCE
+
+
+def _quality_without_errors(plain: _End, end: _End) -> dict[str, Any]:
+    """Return the goodness of fit without the errors of T that a fit added.
+
+    These errors would explain any misfit.
+
+    Args:
+        plain: end of the search without them.
+        end: end of the last search, whose values are judged if the first one did not converge.
+    """
+    flat = plain.best.flat
+    if not plain.best.converged:
+        flat = end.best.flat[: flat.size]  # the added errors are the last unknowns
+    return goodness(plain.problem, plain.problem.evaluate(flat))
+
+
 def _guess_of_error(m: CurveRows, computed: np.ndarray) -> float:
     """Return the standard deviation of ln T about a smooth curve, from second differences.
 
@@ -173,13 +187,13 @@ def _guess_of_error(m: CurveRows, computed: np.ndarray) -> float:
     return float(np.clip(np.sqrt(variance), *ERROR_LIMITS))
 
 
-def check_computed(problem: Problem, end: Minimum) -> None:
+def _check_computed(problem: Problem, end: Minimum) -> None:
     """Raise RuntimeError if one of the curves was not computed where a search ended."""
     for curve in problem.evaluate(end.flat).curves.values():
         fault = int(curve.get("status", status.OK))
         if fault != status.OK:
             values = [np.asarray(value) for _, value in problem.parts(end.flat)]
-            free = zip(titles(problem), values, strict=False)
+            free = zip(problem.places, values, strict=False)
             at = ", ".join(f"{name} = {np.array2string(x, precision=3)}" for name, x in free)
             raise RuntimeError(
                 f"{type(problem.model).__name__} could not compute the curve at {at}, where the "
@@ -192,7 +206,7 @@ def check_computed(problem: Problem, end: Minimum) -> None:
         )
 
 
-def distant_curves(problem: Problem, found: Evaluation) -> list[str]:
+def _distant_curves(problem: Problem, found: Evaluation) -> list[str]:
     """Return the labels of curves that no fit and no alternative comes near.
 
     All alternatives begin at the same T_0: values that are far off are in another unit, and the
@@ -203,12 +217,12 @@ def distant_curves(problem: Problem, found: Evaluation) -> list[str]:
         T = m.values[:, 0][m.used[:, 0] > 0]
         computed = found.curves[m.label]["temperature"][m.used[:, 0] > 0]
         distances = np.abs(np.log(np.maximum(T, TINY) / computed))
-        if np.mean(distances > np.log(MAX_DISTANCE)) >= DISTANT_SHARE:
+        if np.mean(distances > np.log(DISTANT_FACTOR)) >= DISTANT_SHARE:
             labels.append(m.label)
     return labels
 
 
-def _outlier_notes(problem: Problem, first: np.ndarray, max_steps: int) -> list[str]:
+def _outlier_notes(problem: Problem, first: np.ndarray, max_steps: int) -> list[Message]:
     """Return a clause on far outliers with the first parameter of a fit without them; [] if such a
     fit is no better."""
     rest, end, left_out = without_outliers(problem, first, max_steps)
@@ -228,7 +242,7 @@ def _outlier_notes(problem: Problem, first: np.ndarray, max_steps: int) -> list[
         value=rest.estimates(end.flat)[0],
         error=np.sqrt(inverse(found.information)[0, 0]) * rest.slopes(end.flat)[0],
     )
-    return [str(message)]
+    return [message]
 
 
 def _result(
@@ -253,7 +267,7 @@ def _result(
         curves[m.label] = _as_curve(m, found.curves[m.label])
     is_single = [*gases] == [""]
     return Fit(
-        names=titles(problem),
+        names=tuple(problem.places),
         model=problem.model,
         model_name=problem.model.name,
         measurements=request.measurements,
@@ -329,11 +343,6 @@ def _scatter(
     }
 
 
-def titles(problem: Problem) -> tuple[str, ...]:
-    """Return the names of the free parameters."""
-    return tuple(_places(problem))
-
-
 def parameter_ranges(
     problem: Problem, explanations: Explanations | None
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -341,25 +350,13 @@ def parameter_ranges(
     if explanations is None:
         return {}
     low, high = explanations.ranges()
-    return {name: (low[place], high[place]) for name, place in _places(problem).items()}
-
-
-def _places(problem: Problem) -> dict[str, slice]:
-    """Return the places of the free parameters in the array of the unknowns, by name."""
-    places = {}
-    begin = 0
-    for u in problem.unknowns:
-        end = begin + u.size
-        if end <= problem.num_free:
-            places[u.title] = slice(begin, end)
-        begin = end
-    return places
+    return {name: (low[place], high[place]) for name, place in problem.places.items()}
 
 
 def _residuals(problem: Problem, found: Evaluation) -> dict[str, dict[str, np.ndarray]]:
     """Return the residuals by label, and by field of the curve or "drop test"."""
     residuals: dict[str, dict[str, np.ndarray]] = {m.label: {} for m in problem.measurements}
-    by_label = {m.label: m for m in problem.curves}
+    curves = {m.label: m for m in problem.curves}
     for row in found.rows:
         if row.is_prior or row.label is None:
             continue
@@ -368,7 +365,7 @@ def _residuals(problem: Problem, found: Evaluation) -> dict[str, dict[str, np.nd
             continue
         of_T, of_rotation = np.split(row.values, 2)
         residuals[row.label]["temperature"] = of_T
-        if by_label[row.label].uses_rotation:
+        if curves[row.label].uses_rotation:
             residuals[row.label]["rotational_temperature"] = of_rotation
     return residuals
 
@@ -390,44 +387,3 @@ def describe_gas(gas: Gas, m: CurveRows) -> dict[str, float]:
     if np.isfinite(first.beta):
         described["beta"] = float(first.beta)
     return described
-
-
-def with_messages(
-    request: Request,
-    result: Fit,
-    explanations: Explanations | None,
-    notes: Iterable[str],
-    share: float,
-) -> Fit:
-    """Return a result with its first line, verdict and reasons.
-
-    Args:
-        request: of the user.
-        result: without words.
-        explanations: the fitted law and its alternatives; None if they were not compared.
-        notes: further reasons.
-        share: of the errors of the measurement in the variances of T, see `measurement_share`.
-    """
-    limitations: dict[str, Limitation] = {}
-    notes = list(notes)
-    gases = by_label(result.gas)
-    for label, m in request.measurements.items():
-        if isinstance(m.data, DropTest):
-            continue
-        gas = gases[label]
-        N = m.num_particles
-        for limitation in request.model.limitations(gas, N):
-            limitations.setdefault(limitation.words, limitation)
-        if gas.container is not None:
-            notes.append(str(Message("gravity")))
-        if N is not None and gas.container is None and "walls" not in m.absent:
-            box = Message("box", of=label, number=N, walls=describe_walls(gas, N))
-            notes.append(str(box))
-    return with_conclusions(
-        result,
-        explanations,
-        tuple(limitations.values()),
-        notes,
-        quick=request.quick,
-        measurement_share=share,
-    )

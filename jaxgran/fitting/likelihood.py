@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.measurement import START_TIME, Measurement
-from jaxgran.data.run_options import DEFAULTS
+from jaxgran.data.run_options import Run
 from jaxgran.fitting.guesses import guess_from_data
 from jaxgran.fitting.innovations import (
     Filtered,
@@ -30,7 +30,7 @@ from jaxgran.fitting.innovations import (
     log_ratio,
 )
 from jaxgran.fitting.measured_rows import curve_rows, with_rate_error
-from jaxgran.fitting.prediction import COMMON_FACTORS
+from jaxgran.fitting.prediction import COMMON_FACTORS, diffusive_share, maxwellian_collisions
 from jaxgran.fitting.rows import CurveRows, Observed
 from jaxgran.fitting.time_grid import TimeGrid, time_grid
 from jaxgran.models.base import AbstractModel
@@ -98,9 +98,9 @@ def log_likelihood(
         )
     model.check_scene(gas)
     with jax.ensure_compile_time_eval():  # the measurement is known, where the gas is traced
-        data = _data(measurement, model)
+        data = _measured_curve(measurement, model)
     times = data.grid.times
-    computed = model.simulate(gas, jnp.asarray(times), DEFAULTS)
+    computed = model.simulate(gas, jnp.asarray(times), Run())
     nodes = _nodes(gas, times, computed, measurement.of_energy)
     value = _likelihood_of_temperatures(gas, nodes, data)
     if data.rows.displacement is not None:
@@ -108,13 +108,13 @@ def log_likelihood(
     return jnp.where(jnp.isnan(value), -jnp.inf, value)
 
 
-class _Data(NamedTuple):
-    """A measured curve.
+class _MeasuredCurve(NamedTuple):
+    """A measured curve as a likelihood needs it; nothing here depends on the gas.
 
     Attributes:
-        rows: as it is compared with the model, with the error of its cooling rate.
-        grid: times at which the model computes it.
-        observed: the measured values among these.
+        rows: the curve as it is compared with a model, with the error of the model's cooling rate.
+        grid: the times of the nodes, at which the model computes T.
+        observed: the measured values, their errors and whether they are used, at the nodes.
         steps_of_N: values of ln N over which a likelihood is integrated, in standard errors of its
             prior.
     """
@@ -125,14 +125,16 @@ class _Data(NamedTuple):
     steps_of_N: Float[np.ndarray, "steps"]
 
 
-def _data(measurement: Measurement, model: AbstractModel) -> _Data:
+def _measured_curve(measurement: Measurement, model: AbstractModel) -> _MeasuredCurve:
     rows, _ = curve_rows("", measurement, model, fits_T_0=False, fits_t0=False)
     guess = guess_from_data(measurement.gas, rows.curve, LAW_CONSTANTS)
     rows = with_rate_error(rows, model, guess)
     grid = time_grid(np.asarray(rows.curve.times) * rows.faster, rows.unit_time)
     observed = jax.tree.map(jnp.asarray, rows.at_nodes(grid.times.size, grid.place))
     is_known = measurement.num_particles is not None
-    return _Data(rows, grid, observed, STEPS_OF_KNOWN_N if is_known else STEPS_OF_UNKNOWN_N)
+    return _MeasuredCurve(
+        rows, grid, observed, STEPS_OF_KNOWN_N if is_known else STEPS_OF_UNKNOWN_N
+    )
 
 
 def _nodes(gas: Gas, times: np.ndarray, computed: CoolingCurve, of_energy: bool) -> Nodes:
@@ -141,7 +143,7 @@ def _nodes(gas: Gas, times: np.ndarray, computed: CoolingCurve, of_energy: bool)
     T_rot = computed.rotational_temperature
     collisions = computed.collisions
     if collisions is None:
-        collisions = _maxwellian_collisions(gas, times, computed.temperature)
+        collisions = maxwellian_collisions(gas, times, computed.temperature)
     size_ratio = None
     by_size_ratio = None
     if computed.size_ratio is not None:
@@ -158,29 +160,22 @@ def _nodes(gas: Gas, times: np.ndarray, computed: CoolingCurve, of_energy: bool)
     )
 
 
-def _maxwellian_collisions(gas: Gas, times: np.ndarray, T: Array) -> Array:
-    """Return collisions per particle of a Maxwellian gas, for a model that does not count them."""
-    speed = jnp.sqrt(T / gas.temperature)
-    steps = jnp.diff(times) * (speed[1:] + speed[:-1]) / 2 * gas.collision_frequency
-    return jnp.append(0.0, jnp.cumsum(steps))
-
-
-def _likelihood_of_temperatures(gas: Gas, nodes: Nodes, data: _Data) -> Float[Array, ""]:
+def _likelihood_of_temperatures(gas: Gas, nodes: Nodes, data: _MeasuredCurve) -> Float[Array, ""]:
     """Return the logarithm of the likelihood of T and T_rot."""
     observed = data.observed
     logs = _log_measured(gas, nodes, data.rows.measurement.of_energy)
     residuals = log_ratio(observed.values, logs, observed.errors)
     variances = (observed.errors / jnp.exp(logs)) ** 2
     factors = _common_factors(data.rows, residuals.shape)
-    columns = jnp.stack([residuals, *factors.shapes], axis=-1)
-    found = _filtered_for_each_N(gas, nodes, columns, variances, data)
+    columns = jnp.stack([residuals, *factors.columns], axis=-1)
+    filtered_columns = _filtered_for_each_N(gas, nodes, columns, variances, data)
 
-    def at_one_N(found: Filtered, step: Array) -> Array:
-        square = _without_factors(found.values, observed.used / found.variances, factors.widths)
-        log_determinant = jnp.sum(observed.used * jnp.log(found.variances))
+    def at_one_N(one: Filtered, step: Array) -> Array:
+        square = _without_factors(one.values, observed.used / one.variances, factors.widths)
+        log_determinant = jnp.sum(observed.used * jnp.log(one.variances))
         return -0.5 * (square + log_determinant + step**2)
 
-    each = jax.vmap(at_one_N, in_axes=(-1, 0))(found, jnp.asarray(data.steps_of_N))
+    each = jax.vmap(at_one_N, in_axes=(-1, 0))(filtered_columns, jnp.asarray(data.steps_of_N))
     change = log_density_change(observed.values, logs, observed.errors)
     return jax.scipy.special.logsumexp(each) - 0.5 * jnp.sum(observed.used * change)
 
@@ -199,18 +194,18 @@ class _CommonFactors(NamedTuple):
     """Logarithms of common factors of T and T_rot, Gaussian about 0.
 
     Attributes:
-        shapes: derivative of the residuals in each of them, shape (nodes, 2).
+        columns: derivative of the residuals in each of them.
         widths: their standard deviations.
     """
 
-    shapes: list[Float[Array, "nodes 2"]]
+    columns: list[Float[Array, "nodes 2"]]
     widths: Float[Array, "factors"]
 
 
 def _common_factors(rows: CurveRows, shape: tuple[int, ...]) -> _CommonFactors:
     names = [name for name in COMMON_FACTORS if name in rows.nuisances]
-    shapes = [jnp.broadcast_to(jnp.asarray(COMMON_FACTORS[name]), shape) for name in names]
-    return _CommonFactors(shapes, jnp.asarray([rows.nuisances[name] for name in names]))
+    columns = [jnp.broadcast_to(jnp.asarray(COMMON_FACTORS[name]), shape) for name in names]
+    return _CommonFactors(columns, jnp.asarray([rows.nuisances[name] for name in names]))
 
 
 def _filtered_for_each_N(
@@ -218,7 +213,7 @@ def _filtered_for_each_N(
     nodes: Nodes,
     columns: Float[Array, "nodes 2 columns"],
     variances: Float[Array, "nodes 2"],
-    data: _Data,
+    data: _MeasuredCurve,
 ) -> Filtered:
     """Return what `filtered` does with values of N in place of its neighbouring gases."""
     steps = data.steps_of_N
@@ -227,10 +222,11 @@ def _filtered_for_each_N(
         return jnp.broadcast_to(x[..., None], (*x.shape, steps.size))
 
     each = jax.tree.map(with_axis_of_N, nodes)
+    each = each._replace(times=nodes.times, sonine=nodes.sonine)  # the same for all gases: `Nodes`
     noise = data.rows.noise(data.grid.times, jnp.exp(data.rows.grains.log_error * steps))
     return filtered(
         jax.tree.map(lambda x: jnp.broadcast_to(x, (steps.size, *jnp.shape(x))), gas),
-        each._replace(times=nodes.times, sonine=nodes.sonine),
+        each,
         with_axis_of_N(columns),
         with_axis_of_N(variances),
         with_axis_of_N(jnp.ones_like(nodes.log_temperature)),
@@ -247,8 +243,8 @@ def _without_factors(
 ) -> Float[Array, ""]:
     """Return -2 ln L of the first column r, ``r^T W r``, with its common factors integrated out.
 
-    The further columns F are the shapes of the factors, which are Gaussian about 0 with the widths
-    s. They add ``F s^2 F^T`` to the covariance W^-1, and ``ln det(1 + s F^T W F s)`` to -2 ln L.
+    The further columns F are those of the factors, which are Gaussian about 0 with the widths s.
+    They add ``F s^2 F^T`` to the covariance W^-1, and ``ln det(1 + s F^T W F s)`` to -2 ln L.
     """
     flat = columns.reshape(-1, columns.shape[-1])
     weights = weights.reshape(-1)
@@ -263,17 +259,15 @@ def _without_factors(
 
 
 def _likelihood_of_displacement(
-    nodes: Nodes, computed: CoolingCurve, data: _Data
+    nodes: Nodes, computed: CoolingCurve, data: _MeasuredCurve
 ) -> Float[Array, ""]:
     """Return the logarithm of the likelihood of <dr^2>."""
     measured = data.rows.displacement
     assert measured is not None and computed.displacement is not None
     place = data.grid.place
-    # The common factor is one of D: the ballistic flight before collisions has no error.
-    collisions = nodes.collisions[place]
-    diffusive = collisions / (1 + collisions)
+    of_factor = diffusive_share(nodes.collisions[place])
     known = jnp.where(measured.used, computed.displacement[place], 1.0)
-    columns = jnp.stack([measured.logs - jnp.log(known), diffusive], axis=-1)
+    columns = jnp.stack([measured.logs - jnp.log(known), of_factor], axis=-1)
     columns = jnp.asarray(measured.whitening) @ columns
     weights = jnp.ones(measured.logs.shape)
     return -0.5 * _without_factors(columns, weights, jnp.asarray([measured.accuracy]))

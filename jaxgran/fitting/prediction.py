@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.guesses import power_of_line
@@ -154,8 +155,8 @@ def predicted_curve(
     linear = linearise(model, gas, grid.times, {e.name for e in elements}, tolerance)
     fields = {name: x[grid.place] if np.ndim(x) else x for name, x in linear.values.items()}
     if "collisions" not in linear.values:
-        counted = _maxwellian_collisions(gas, grid.times, linear.values["temperature"])
-        linear = linear._replace(values=linear.values | {"collisions": counted})
+        counted = maxwellian_collisions(gas, grid.times, linear.values["temperature"])
+        linear = linear._replace(values=linear.values | {"collisions": np.asarray(counted)})
     curve = _ExpandedCurve(rows, gas, grid, is_before, linear)
     prediction = curve.prediction(values)
     return PredictedCurve(
@@ -186,11 +187,30 @@ def steady_curve(
     return LinearisedCurve(values, {}, {})
 
 
-def _maxwellian_collisions(gas: Gas, times: np.ndarray, T: np.ndarray) -> np.ndarray:
-    """Return collisions per particle of a Maxwellian gas, for a model that does not count them."""
-    speed = np.sqrt(T / float(gas.temperature))
-    steps = np.diff(times) * (speed[1:] + speed[:-1]) / 2
-    return np.append(0.0, np.cumsum(steps)) * float(gas.collision_frequency)
+def maxwellian_collisions(gas: Gas, times: ArrayLike, T: ArrayLike) -> Float[Array, "times"]:
+    """Return the collisions per particle of a Maxwellian gas, for a model that does not count them.
+
+    They are the integral of ``omega_0 sqrt(T/T_0)`` over time, by the trapezoidal rule for sqrt(T).
+
+    Args:
+        gas: at t = 0, with its temperature T_0 and its collision frequency omega_0.
+        times: from 0 on, s, shape (times,).
+        T: temperature at these times, m^2/s^2, shape (times,).
+    """
+    speed = jnp.sqrt(jnp.asarray(T) / gas.temperature)
+    steps = jnp.diff(jnp.asarray(times)) * (speed[1:] + speed[:-1]) / 2
+    return jnp.append(0.0, jnp.cumsum(steps * gas.collision_frequency))
+
+
+def diffusive_share(collisions: Any) -> Any:
+    """Return ``C/(1 + C)``, the part of ln <dr^2> that follows an error of ln D.
+
+    The ballistic flight before the first collision has no such error.
+
+    Args:
+        collisions: C, per particle since t = 0, an array of numpy or JAX.
+    """
+    return collisions / (1 + collisions)
 
 
 class _EnergyRatio(NamedTuple):

@@ -125,6 +125,18 @@ class Problem:
         """The measured curves."""
         return tuple(m for m in self.measurements if isinstance(m, CurveRows))
 
+    @property
+    def places(self) -> dict[str, slice]:
+        """Places of the free parameters in the array of the unknowns, by their names in a `Fit`."""
+        places = {}
+        begin = 0
+        for u in self.unknowns:
+            end = begin + u.size
+            if end <= self.num_free:
+                places[u.title] = slice(begin, end)
+            begin = end
+        return places
+
     def fixed_with(self, values: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
         """Return the fixed values with further ones, by label and name."""
         labels = {*self.fixed, *values}

@@ -14,34 +14,39 @@ from jaxtyping import Float
 from jaxgran.fitting.problem import Evaluation, Problem
 
 LAST_STEP = 0.01
-"""Length of a Newton step, in standard errors, below which a search ends."""
+"""A search ends where the next Newton step is shorter than this, in standard errors."""
 
 CONVERGED_STEP = 0.03
-"""Length of the last Newton step, in standard errors, up to which a search has converged."""
+"""A search has converged if the next Newton step is shorter than this, in standard errors."""
 
 STALLED_STEP = 0.3
-"""The same of a search in which no step lowers -2 ln L: it stalls at a kink, where a measured point
-passes t0."""
-
-NEGLIGIBLE_STEP = 1e-4
-"""Length of a Newton step, in standard errors, that is not taken after the last one."""
+"""A search that has stalled has converged if the next Newton step is shorter than this, in standard
+errors. It stalls at a kink of -2 ln L, where a measured point passes t0."""
 
 MAX_STALLED = 6
-"""Number of steps in succession that lower -2 ln L by less than `MIN_FALL_OF_STEP`, after which a
-search ends."""
+"""A search has stalled after this number of successive steps that hardly lower -2 ln L."""
 
 MIN_FALL_OF_STEP = 1e-4
-"""Largest fall of -2 ln L that counts as round-off."""
+"""A step hardly lowers -2 ln L if it lowers it by less than this, which may be round-off."""
 
-MAX_STEP = 1.0
-"""Length of the first step of the unconstrained parameters: a factor e of a positive one."""
+NEGLIGIBLE_STEP = 1e-4
+"""After a search a further Newton step is tried if it is longer than this, in standard errors, and
+shorter than `CONVERGED_STEP`."""
+
+FIRST_RADIUS = 1.0
+"""Radius at first of the trust region, in the unconstrained parameters: a factor e of a positive
+one."""
 
 MAX_DISTANCE = {"dissipative_constant": 7.0}
-"""Largest change of an unconstrained parameter in a search: a factor 1000 of A, far beyond which
-impacts lose all energy and T does not depend on it."""
+"""Largest change of an unconstrained parameter in a search. It is a factor 1000 of A: far beyond,
+impacts lose all energy, and T does not depend on A."""
 
 MAX_DISTANCE_OF_OTHERS = 25.0
-"""The same of others: a factor 7e10 of a positive one."""
+"""Largest change of an unconstrained parameter that `MAX_DISTANCE` does not list: a factor 7e10 of
+a positive one."""
+
+MAX_STEP = 1.0
+"""Largest step of a profile (`jaxgran.fitting.profiles`)."""
 
 MULTIMODAL_PARAMETER = "tangential_restitution"
 """Parameter in which the likelihood has several maxima: on both sides of the beta_t at which
@@ -110,7 +115,9 @@ def newton_step(found: Evaluation) -> NewtonStep:
 
 @dataclass(frozen=True)
 class Objective:
-    """-2 ln L in the region of a search; outside it has its value at the nearest unknowns.
+    """-2 ln L inside a region.
+
+    Outside, it takes the value at the nearest point of the region, so its slope there is 0.
 
     Attributes:
         problem: of a fit.
@@ -127,7 +134,7 @@ class Objective:
         return np.clip(flat, self.origin - farthest, self.origin + farthest)
 
     def evaluate(self, flat: np.ndarray) -> Evaluation:
-        """Return -2 ln L at the nearest unknowns; it does not depend on those outside."""
+        """Return -2 ln L and its derivatives at the nearest point of the region."""
         near = self.nearest(flat)
         found = self.problem.evaluate(near)
         outside = flat != near
@@ -159,8 +166,10 @@ class Objective:
 
 
 @dataclass
-class _Ending:
-    """Ends a search after a step, where the next one is short or -2 ln L no longer falls.
+class _StoppingRule:
+    """Ends a search after a step if the next one is short or -2 ln L no longer falls.
+
+    It is called after each step: scipy ends a search where its callback raises StopIteration.
 
     Attributes:
         objective: of the search.
@@ -210,31 +219,34 @@ def minimise(
         return Minimum(first, np.inf, steps=0, converged=False)
     if objective.newton_length(first) < tolerance:
         return Minimum(first, objective.value(first), steps=0, converged=True)
-    ending = _Ending(objective, tolerance)
+    rule = _StoppingRule(objective, tolerance)
     solution = scipy.optimize.minimize(
         objective.value,
         first,
         jac=objective.gradient,
         hess=objective.hessian,
         method="trust-exact",
-        callback=ending,
+        callback=rule,
         options={
             "gtol": 0.0,
             "maxiter": max_steps,
-            "initial_trust_radius": MAX_STEP,
-            "max_trust_radius": 2 * MAX_STEP,
+            "initial_trust_radius": FIRST_RADIUS,
+            "max_trust_radius": 2 * FIRST_RADIUS,
         },
     )
     end = objective.nearest(np.asarray(solution.x))
-    value = objective.value(end)
     step = newton_step(problem.evaluate(end))
-    limit = max(tolerance, STALLED_STEP if ending.has_stalled else CONVERGED_STEP)
+    limit = max(tolerance, STALLED_STEP if rule.has_stalled else CONVERGED_STEP)
     if NEGLIGIBLE_STEP < step.length < CONVERGED_STEP:
-        further = objective.nearest(end + step.change)
-        if objective.value(further) < value + MIN_FALL_OF_STEP:
-            end = further
-            value = objective.value(further)
-    return Minimum(end, value, int(solution.nit), step.length < limit)
+        end = _with_last_step(objective, end, step)
+    return Minimum(end, objective.value(end), int(solution.nit), step.length < limit)
+
+
+def _with_last_step(objective: Objective, end: np.ndarray, step: NewtonStep) -> np.ndarray:
+    """Return the unknowns after a further step, or as they are if it raises -2 ln L."""
+    further = objective.nearest(end + step.change)
+    is_no_higher = objective.value(further) < objective.value(end) + MIN_FALL_OF_STEP
+    return further if is_no_higher else end
 
 
 def minima_from_starts(

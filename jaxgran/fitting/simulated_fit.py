@@ -1,5 +1,6 @@
 """Fits of stochastic models: the estimate of a search through simulations, as a `Fit`."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -10,14 +11,9 @@ from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.data.measurement import Measurement
 from jaxgran.fitting.alternatives import Explanations, compare_alternatives
 from jaxgran.fitting.comparison import Residuals
+from jaxgran.fitting.conclusions import with_conclusions
 from jaxgran.fitting.descent import Descent
-from jaxgran.fitting.estimate import (
-    describe_gas,
-    fit_without_noise,
-    parameter_ranges,
-    titles,
-    with_messages,
-)
+from jaxgran.fitting.estimate import describe_gas, fit_without_noise, parameter_ranges
 from jaxgran.fitting.goodness import goodness
 from jaxgran.fitting.information import undetermined
 from jaxgran.fitting.measured_rows import curve_rows, with_rate_error
@@ -139,7 +135,7 @@ def _result(
     of_theory: Request,
     sims: Simulations,
     search: Search,
-    notes: list[str],
+    notes: Sequence[str | Message],
 ) -> Fit:
     """Return the result of a search through simulations."""
     problem = sims.problem
@@ -163,12 +159,12 @@ def _result(
         else:
             notes = [*notes, NOT_COMPARED]
     if bias >= MIN_REPORTED_BIAS:
-        notes = [*notes, str(Message("slopes", share=100 * bias))]
+        notes = [*notes, Message("slopes", share=100 * bias)]
     rows = _residuals(search, expansion)
     found = summed([rows], {})
     scatter_error = (2 / expansion.degrees_of_freedom) ** 0.5
     result = Fit(
-        names=titles(problem),
+        names=tuple(problem.places),
         model=problem.model,
         model_name=problem.model.name,
         measurements=request.measurements,
@@ -193,7 +189,7 @@ def _result(
         trace=search.trace,
     )
     share = _share_of_errors(sims, search, rows)
-    return with_messages(request, result, explanations, notes, share)
+    return with_conclusions(request, result, explanations, notes, share)
 
 
 def _residuals(search: Search, expansion: Expansion) -> Residuals:

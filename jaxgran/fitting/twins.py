@@ -10,6 +10,7 @@ from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.data.curve import WITH_ERRORS, CoolingCurve
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import START_TIME, Measurement
+from jaxgran.data.run_options import Run
 from jaxgran.fitting.alternatives import Alternative
 from jaxgran.fitting.kinds import (
     DRAG_ADDED,
@@ -220,7 +221,7 @@ def _twin_of_curve(measurement: Measurement, gas: Gas) -> CoolingCurve:
         # As in the fit, whose alternatives have Gaussian spins where its spheres are smooth.
         computed = curve_of_program(model.simplified_for(measurement.gas), gas, times)
     else:
-        computed = model.simulate(gas, as_jax_arrays(times))
+        computed = model.simulate(gas, as_jax_arrays(times), Run())
     fields: dict[str, Any] = {"times": np.asarray(measured.times)}
     for quantity in WITH_ERRORS:
         given = getattr(measured, quantity.field)

@@ -20,7 +20,7 @@ from jaxgran._utils.tracing import (
     truncate_to,
 )
 from jaxgran.data.curve import CoolingCurve
-from jaxgran.data.run_options import DEFAULTS, Run
+from jaxgran.data.run_options import Run
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.error_model import ErrorModel
@@ -355,7 +355,7 @@ class KineticTheory(AbstractModel):
             needed.discard("diffusion")
         return dataclasses.replace(self, corrections=needed)
 
-    def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
+    def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run) -> CoolingCurve:
         """Return the cooling curve at the given times, s, as `AbstractModel.simulate` describes."""
         size = times.size
         padded = pad_to(times, padded_length(size))

@@ -17,7 +17,7 @@ from jaxgran._utils.tracing import any_traced, nan_where
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.particles import Particles
 from jaxgran.data.quantities import QUANTITIES
-from jaxgran.data.run_options import DEFAULTS, Run
+from jaxgran.data.run_options import Run
 from jaxgran.gradients.rule import Result
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel
@@ -135,7 +135,7 @@ class AbstractParticleModel(AbstractModel):
     def derivative_bias(self, gas: Gas, times: Array, flow_share: Array) -> Array | None:
         """Estimate the bias of the derivatives of ln T from the flow in each replica."""
 
-    def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run = DEFAULTS) -> CoolingCurve:
+    def simulate(self, gas: Gas, times: Float[Array, "times"], run: Run) -> CoolingCurve:
         """Return the cooling curve at the given times, s, as `AbstractModel.simulate` describes."""
         invalid, fault = self.invalid_times(gas, times)
         if self.start is not None:  # then T_0 is a constant unit of speed in derivatives

@@ -64,6 +64,7 @@ BAD_INPUT = {
     "fit nowhere.csv": "no such file",
     "fit folder": "not a text file",
     "fit scene.toml --free Z": "Z",
+    "fit thin.csv --absent wall": "--absent",
     "cool": "SCENE",
     "cool nowhere.toml --until 1": "no such file",
     "cool scene.toml": "Give the last one, in s, as --until",

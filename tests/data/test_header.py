@@ -8,6 +8,7 @@ from pytest import approx
 
 import jaxgran
 from jaxgran import read_measurement
+from jaxgran.cli.options import parse_settings
 from jaxgran.data.header import gas_of_header
 from jaxgran.data.header_lines import header_in_si
 from jaxgran.data.measurement_header import priors_of_header
@@ -52,6 +53,15 @@ def test_an_error_in_per_cent_needs_its_value():
     assert float(header_in_si({"T_scale": "2.00 ± 0.03"})["T_scale_err"]) == approx(0.015)
     assert float(header_in_si({"T_scale": "2 ± 3 %"})["T_scale_err"]) == approx(0.03)
     assert float(header_in_si({"T_scale": "2", "T_scale_err": "0.03"})["T_scale_err"]) == 0.03
+
+
+@pytest.mark.parametrize("scale", ["2.00 +- .03", "2.00(3)", "2,00 ± 0,03"])
+def test_the_scale_of_T_is_a_known_key_whose_error_is_a_part_of_it(scale, write):
+    measurement = read_measurement(write(text_of(T_scale=scale)))  # a warning would be an error
+    assert measurement.calibration_error == approx(0.015)
+    assert parse_settings([f"T_scale={scale}"]) == {"T_scale": scale}
+    with pytest.raises(ValueError, match="T_scale: the value must not be 0"):
+        header_in_si({"T_scale": "0 ± 0.03"})
 
 
 def test_frames_are_counted_per_second_whatever_the_unit_of_times():
