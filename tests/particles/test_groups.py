@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.particles.run import MIN_SPHERES_PER_RUN, Groups, grouped
+from jaxgran.particles.groups import MIN_SPHERES_PER_RUN, Groups, grouped
 from tests.beads import glass_beads, lattice
 
 

@@ -1,8 +1,6 @@
-"""The loop on the host: resumption, the bar, failures, arrays that grow, and interruption."""
+"""The loop on the host: resumption, the bar, failures, and arrays that grow."""
 
 import io
-import signal
-import time
 from contextlib import redirect_stderr
 from typing import NamedTuple
 
@@ -19,7 +17,8 @@ from jaxgran.gradients.rule import Records
 from jaxgran.particles import run
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import AbstractDynamics
-from jaxgran.particles.run import Groups, Recorder, compiling, run_on_host, run_traced
+from jaxgran.particles.groups import Groups
+from jaxgran.particles.run import Recorder, compiling, run_on_host, run_traced
 from jaxgran.particles.snapshot import Units
 from tests.beads import assert_same, glass_beads
 
@@ -232,34 +231,3 @@ def test_a_run_says_that_it_compiles_once(monkeypatch):
             jaxgran.cool(glass_beads(), [1e-3], model=model)
         said.append("compiling ..." in stream.getvalue())
     assert said == [True, False]
-
-
-@jax.jit
-def some_seconds():
-    # Not of scalars: JAX does not return before such programs have ended.
-    return jax.lax.fori_loop(0, 3000, lambda i, x: 0.99 * x @ x, jnp.eye(300))
-
-
-@pytest.mark.parametrize(
-    "wait",
-    [
-        lambda: run.in_thread(lambda: time.sleep(20)),
-        lambda: run.block_until_ready(some_seconds()),
-    ],
-)
-def test_waiting_can_be_interrupted(wait):
-    some_seconds.lower().compile()
-
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    old = signal.signal(signal.SIGALRM, interrupt)
-    began = time.monotonic()
-    try:
-        signal.setitimer(signal.ITIMER_REAL, 0.3)
-        with pytest.raises(KeyboardInterrupt):
-            wait()
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, old)
-    assert time.monotonic() - began < 1.5
