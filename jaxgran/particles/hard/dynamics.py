@@ -316,7 +316,8 @@ class HardDynamics(AbstractSphereDynamics):
         wanted = max(0.5 * self.share * len(state.position), MIN_IMPACTS)
         num_in_window = jnp.sum(impacts).astype(lost.dtype)
         if progress.num_wall_impacts is not None:  # each of one sphere, not of two
-            num_in_window = found + jnp.sum(progress.num_wall_impacts).astype(lost.dtype) / 2
+            num_on_walls = jnp.sum(progress.num_wall_impacts).astype(lost.dtype)
+            num_in_window = num_in_window + num_on_walls / 2
         ratio = jnp.clip((wanted / jnp.maximum(num_in_window, 1)) ** WINDOW_EXPONENT, 0.5, 1.5)
         paths = progress.paths
         internal = state.internal
