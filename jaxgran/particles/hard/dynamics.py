@@ -485,9 +485,7 @@ def hard_records(state: SphereState, scene: SphereScene, replicas: int) -> Recor
         lambda x: x * scene.collision_frequency, tangents.directions.drag
     )
     time = state.time + state.time_rest
-    rates, slopes = exchange_slopes(
-        values, tangents, scene.drag_rates, drag_directions, time, (n, d)
-    )
+    rates, slopes = exchange_slopes(values, tangents, scene.drag_rates, drag_directions, time, n, d)
     if not material.has_elements:
         rates, slopes = (with_dissipated_energy(x, d) for x in (rates, slopes))
     return Records(values, rates, slopes)
