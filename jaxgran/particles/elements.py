@@ -145,8 +145,8 @@ def kick_growth(
 ) -> Array:
     """Return the growth of T by half of the kicks of a step.
 
-    With drag it is the growth for the stored velocities u, which do not decay: a kick of v at a time
-    t is a kick of u that is ``exp(gamma t)`` times as large.
+    With drag it is the growth for the stored velocities u, which do not decay. A kick of v at a
+    time t is a kick of u that is ``exp(gamma t)`` times as large.
 
     Args:
         strength: growth of T in a unit of time.

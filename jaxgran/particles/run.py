@@ -247,7 +247,13 @@ class HostLoop:
         self.progress = progress
 
     def each(self, function: Callable[[Any, Any], T], shared: Any, group: Any) -> T:
-        """Call a short function for each group: with an input of all and one of this group."""
+        """Call a function for each group in compiled code that runs for a short time.
+
+        Args:
+            function: of the module, see `over_groups`.
+            shared: its first input, the same for all groups.
+            group: its second input, with a first axis of groups.
+        """
         return over_groups(function, self.groups.devices, short=True)(shared, group)
 
     def time(self, state: Any) -> float:
