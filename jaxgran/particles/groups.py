@@ -77,6 +77,24 @@ class Groups(NamedTuple):
         rows = self.rows
         return jax.tree.map(lambda x: x.reshape(self.number, -1, x.shape[-1])[rows], arrays)
 
+    def join(self, arrays: Any, axis: int = 0) -> Any:
+        """Return arrays in which an axis of groups is joined with the next axis, of replicas."""
+
+        def joined(x: Any) -> Array:
+            kept = np.take(np.asarray(x), np.arange(self.number), axis)
+            replicas = kept.shape[axis] * kept.shape[axis + 1]  # there may be no directions: not -1
+            shape = *kept.shape[:axis], replicas, *kept.shape[axis + 2 :]
+            return jnp.asarray(kept.reshape(shape))
+
+        return jax.tree.map(joined, arrays)
+
+    def join_records(self, records: Records) -> Records:
+        """Return the records of all replicas; their axes are times and groups."""
+        others = self.join(records._replace(tangents={}), axis=1)
+        # Directions come before replicas.
+        tangents = {name: np.moveaxis(x, 1, 2) for name, x in records.tangents.items()}
+        return others._replace(tangents=self.join(tangents, axis=2))
+
 
 def grouped(replicas: int, spheres: int) -> Groups:
     """Return the groups of replicas: one of all of them, or one of each on CPU devices.
@@ -125,20 +143,3 @@ def over_groups(
         # for each other: two replicas of DSMC would take 15 to 20 % longer.
         options = options | {"xla_cpu_multi_thread_eigen": False}
     return jax.jit(call, compiler_options=options)
-
-
-def joined(x: np.ndarray, axis: int, groups: Groups) -> Array:
-    """Return an array in which an axis of groups is joined with the next axis, of replicas."""
-    kept = np.take(x, np.arange(groups.number), axis)
-    replicas = kept.shape[axis] * kept.shape[axis + 1]  # there may be no directions: not -1
-    shape = *x.shape[:axis], replicas, *x.shape[axis + 2 :]
-    return jnp.asarray(kept.reshape(shape))
-
-
-def without_groups(records: Records, groups: Groups) -> Records:
-    """Return the records of all replicas; their axes are times and groups."""
-    others = records._replace(tangents={})
-    of_all = jax.tree.map(lambda x: joined(x, 1, groups), others)
-    # Directions come before replicas.
-    tangents = jax.tree.map(lambda x: joined(np.moveaxis(x, 1, 2), 2, groups), records.tangents)
-    return of_all._replace(tangents=tangents)

@@ -33,7 +33,7 @@ from jaxgran.data.trajectory import Sphere, Trajectory
 from jaxgran.gradients.rule import Records, Result
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import AbstractDynamics, AbstractProcess, P
-from jaxgran.particles.groups import Groups, joined, over_groups, without_groups
+from jaxgran.particles.groups import Groups, over_groups
 from jaxgran.particles.snapshot import Units, apply_save
 
 CHECKPOINT_SECONDS = 60.0
@@ -410,8 +410,8 @@ def run_on_host(
     particles = loop.each(_to_lab_frame, dynamics, reached.state)
     faults = np.asarray(reached.state.status)
     return Result(
-        records=without_groups(reached.records, groups),
-        particles=jax.tree.map(lambda x: joined(np.asarray(x), 0, groups), particles),
+        records=groups.join_records(reached.records),
+        particles=groups.join(particles),
         status=jnp.asarray(np.bitwise_or.reduce(faults, axis=None)),
     )
 
@@ -510,8 +510,7 @@ def _writer(
 
     def write(k: int, state: Any) -> None:
         arrays = loop.each(_to_lab_frame, dynamics, state)
-        of_all = jax.tree.map(lambda x: joined(np.asarray(x), 0, groups), arrays)
-        particles = units.to_particles(replicas, *of_all)
+        particles = units.to_particles(replicas, *groups.join(arrays))
         trajectory.write(k, float(seconds[k]), particles, sphere)
 
     return write

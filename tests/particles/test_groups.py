@@ -28,6 +28,16 @@ def test_devices_have_the_same_number_of_groups():
     np.testing.assert_array_equal(Groups(4, ("a", "b")).rows, [0, 1, 2, 3])
 
 
+@pytest.mark.parametrize("groups", [Groups(1), Groups(3), Groups(3, ("a", "b"))])
+def test_joined_groups_are_the_arrays_that_were_split(groups):
+    position = np.arange(36.0).reshape(18, 2)  # of three replicas
+    split = groups.split({"position": position, "spin": None})
+    assert split["position"].shape == (len(groups.rows), 18 // groups.number, 2)
+    joined = groups.join(split)
+    np.testing.assert_array_equal(joined["position"], position)
+    assert joined["spin"] is None
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [jaxgran.HardSpheres, jaxgran.SoftSpheres])
 def test_large_replicas_on_one_device_run_in_turn(kind):
