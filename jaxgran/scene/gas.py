@@ -198,10 +198,7 @@ class Gas(eqx.Module):
         Raises:
             ValueError: for an unknown name.
         """
-        fields = self._parameter_fields
-        if name not in fields:
-            raise ValueError(f"Gas has no parameter {name!r}; it has {', '.join(fields)}")
-        return fields[name].get(self)
+        return self._field_named(name).get(self)
 
     def replace(self, **values: UserNumber) -> "Gas":
         """Return a copy with new values of some parameters.
@@ -214,16 +211,12 @@ class Gas(eqx.Module):
         Raises:
             ValueError: for an unknown name or a value outside its range.
         """
-        fields = self._parameter_fields
+        fields = [self._field_named(name) for name in values]
         arrays = []
-        for name, value in values.items():
-            self.value(name)  # raises for an unknown name
-            fields[name].domain.check(name, value)
+        for field, (name, value) in zip(fields, values.items(), strict=True):
+            field.domain.check(name, value)
             arrays.append(float_array(value, name, unit_of(name)))
-
-        return eqx.tree_at(
-            lambda module: [fields[name].get(module) for name in values], self, arrays
-        )
+        return eqx.tree_at(lambda module: [field.get(module) for field in fields], self, arrays)
 
     def with_arrays(self, values: dict[str, Any]) -> "Gas":
         """Return a copy with new values of some parameters, whose ranges are not checked.
@@ -242,12 +235,17 @@ class Gas(eqx.Module):
         leaves, structure = jax.tree.flatten(self)
         positions = structure.unflatten(range(len(leaves)))
         for name, value in values.items():
-            self.value(name)  # raises for an unknown name
-            leaves[self._parameter_fields[name].get(positions)] = value
+            leaves[self._field_named(name).get(positions)] = value
         changed = structure.unflatten(leaves)
         # Its parameters have the same places: to find them again takes as long as all else here.
         vars(changed)["_parameter_fields"] = self._parameter_fields
         return changed
+
+    def _field_named(self, name: str) -> ParameterField:
+        fields = self._parameter_fields
+        if name not in fields:
+            raise ValueError(f"Gas has no parameter {name!r}; it has {', '.join(fields)}")
+        return fields[name]
 
     @cached_property
     def _parameter_fields(self) -> dict[str, ParameterField]:
