@@ -229,7 +229,7 @@ class Gas(eqx.Module):
         Raises:
             ValueError: for an unknown name.
 
-        >>> gas.with_arrays({"temperature": np.array([0.01, 0.02])}).temperature.shape
+        >>> gas.with_arrays({"temperature": jnp.array([0.01, 0.02])}).temperature.shape
         (2,)
         """
         leaves, structure = jax.tree.flatten(self)
