@@ -92,7 +92,7 @@ class Groups(NamedTuple):
         """Return the records of all replicas; their axes are times and groups."""
         others = self.join(records._replace(tangents={}), axis=1)
         # Directions come before replicas.
-        tangents = {name: np.moveaxis(x, 1, 2) for name, x in records.tangents.items()}
+        tangents = jax.tree.map(lambda x: np.moveaxis(x, 1, 2), records.tangents)
         return others._replace(tangents=self.join(tangents, axis=2))
 
 

@@ -9,10 +9,8 @@ arrays that are too short.
 A run on the host moves groups of replicas: see `jaxgran.particles.groups`.
 """
 
-import sys
 import time
-from collections.abc import Callable, Hashable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -22,10 +20,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
-from tqdm import tqdm
 
 from jaxgran._utils import status
-from jaxgran._utils.tracing import nan_where, near_map_limit
+from jaxgran._utils.tracing import nan_where
 from jaxgran._utils.waiting import block_until_ready
 from jaxgran.data import checkpoint
 from jaxgran.data.run_options import Run
@@ -34,6 +31,12 @@ from jaxgran.gradients.rule import Records, Result
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import AbstractDynamics, AbstractProcess, P
 from jaxgran.particles.groups import Groups, over_groups
+from jaxgran.particles.progress import (
+    compiling,
+    described_program,
+    drop_programs_near_limit,
+    progress_bar,
+)
 from jaxgran.particles.snapshot import Units, apply_save
 
 CHECKPOINT_SECONDS = 60.0
@@ -153,53 +156,6 @@ def run_traced(
     return Result(records, dynamics.to_lab_frame(state), fault)
 
 
-def progress_bar(end: float, now: float, progress: bool, label: str | None = None) -> tqdm:
-    """Return a bar of the time of a run, which appears on a terminal after some seconds."""
-    return tqdm(
-        total=end,
-        initial=now,
-        disable=None if progress else True,
-        delay=3,
-        desc=label,
-        bar_format="{l_bar}{bar}| {elapsed} elapsed, {remaining} left{postfix}",
-    )
-
-
-_COMPILED: set[Hashable] = set()
-"""Keys of the programs of this process, see `described_program`."""
-
-
-def described_program(process: AbstractProcess, state: Any) -> Hashable:
-    """Return a key of the compiled program: structure, shapes and dtype of its arguments."""
-    leaves, structure = jax.tree.flatten((process, state))
-    return structure, *(x.shape for x in leaves), leaves[-1].dtype
-
-
-def _drop_programs_near_limit(program: Hashable) -> None:
-    """Drop all programs of this process before a new one, near the limit of memory maps."""
-    if program not in _COMPILED and near_map_limit():
-        jax.clear_caches()
-        _COMPILED.clear()
-
-
-@contextmanager
-def compiling(program: Hashable, progress: bool) -> Iterator[None]:
-    """Show "compiling ..." on a terminal during the first call of a program in this process.
-
-    Without `progress` nothing is shown. The progress bar follows.
-    """
-    text = "compiling ..."
-    shown = program not in _COMPILED and progress and sys.stderr.isatty()
-    _COMPILED.add(program)
-    if shown:
-        print(f"\r{text}", end="", file=sys.stderr, flush=True)
-    try:
-        yield
-    finally:
-        if shown:
-            print(f"\r{' ' * len(text)}\r", end="", file=sys.stderr, flush=True)
-
-
 # `over_groups` keeps one compiled program for each function. So these are functions of the module:
 # a lambda or a partial, made anew in each run, would be compiled in each run.
 
@@ -288,7 +244,7 @@ class HostLoop:
             short = kind != (type(self.dynamics), self.dynamics.capacity)
             program = over_groups(_advance, self.groups.devices, short)
             described = described_program(lengthened, state)
-            _drop_programs_near_limit(described)
+            drop_programs_near_limit(described)
             with compiling(described, self.progress):
                 moved = program((lengthened, until), state)
         state, busy = block_until_ready(moved)
