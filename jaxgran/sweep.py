@@ -31,6 +31,7 @@ from tqdm import tqdm
 from jaxgran._utils import status
 from jaxgran._utils.extras import import_extra
 from jaxgran._utils.validation import check_bool, checked_int, checked_times
+from jaxgran._utils.waiting import block_until_ready
 from jaxgran.data.checkpoint import describe_run
 from jaxgran.data.curve import CoolingCurve, from_arrays
 from jaxgran.data.curve_arrays import STATUS, TIME, label_of, to_arrays
@@ -42,7 +43,6 @@ from jaxgran.models.cool import cool
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.spheres import AbstractSpheres
 from jaxgran.particles.capacity import Capacity
-from jaxgran.particles.run import block_until_ready
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.parameters import PARAMETER_UNITS
 

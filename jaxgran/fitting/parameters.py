@@ -77,15 +77,7 @@ def with_parameters(gas: Gas, values: dict[str, Any]) -> Gas:
     """Return a gas with new parameters, of any type of array; ranges are not checked."""
     if not values:
         return gas
-    fields = gas._parameter_fields
-    leaves, structure = jax.tree.flatten(gas)
-    positions = structure.unflatten(range(len(leaves)))
-    for name, value in values.items():
-        leaves[fields[name].get(positions)] = value
-    changed = structure.unflatten(leaves)
-    # Its parameters have the same places: to find them again takes as long as all else here.
-    vars(changed)["_parameter_fields"] = fields
-    return changed
+    return gas.with_arrays(values)
 
 
 def as_floats(values: dict[str, Any]) -> dict[str, np.ndarray]:

@@ -130,10 +130,9 @@ def _directions(gas: Gas, sizes: dict[str, int]) -> tuple[Gas, np.ndarray]:
     """
     count = max(4, 1 << sum(sizes.values()).bit_length())
     along = jax.tree.map(lambda x: np.zeros((count, *x.shape), x.dtype), gas)
-    fields = gas._parameter_fields
     begin = 1
     for name, size in sizes.items():
-        numbers = fields[name].get(along).reshape(count, size)  # a view: this changes `along`
+        numbers = along.value(name).reshape(count, size)  # a view: this changes `along`
         numbers[np.arange(begin, begin + size), np.arange(size)] = 1.0
         begin += size
     return along, np.eye(1, count)[0].astype(jnp.result_type(float))

@@ -24,7 +24,8 @@ from jaxgran.models.base import AbstractModel
 from jaxgran.models.members import by_member, together
 from jaxgran.particles.dynamics import AbstractDynamics
 from jaxgran.particles.elements import flight_time
-from jaxgran.particles.run import Recorder, grouped, run_on_host, run_traced, start_traced
+from jaxgran.particles.groups import grouped
+from jaxgran.particles.run import Recorder, run_on_host, run_traced, start_traced
 from jaxgran.particles.snapshot import Units, resolve_save
 from jaxgran.particles.start import has_other_box, reduced_start
 from jaxgran.scene.gas import Gas

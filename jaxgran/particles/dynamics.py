@@ -91,7 +91,10 @@ class AbstractDynamics(AbstractProcess):
 
         Args:
             key: of the random numbers, one for each group of replicas.
-            each, reach: see `jaxgran.particles.run`.
+            each: ``each(function, shared, group)`` calls a function of the module for every group,
+                with an input that all groups share and the inputs of each.
+            reach: ``reach(stages, state)`` moves a state through processes in turn, each until a
+                time.
         """
 
     @property

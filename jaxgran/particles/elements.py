@@ -15,8 +15,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.extend.random import threefry_2x32
-from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, UInt32
+from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
 from jaxgran.gradients.tangents import ExchangeTangents
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
@@ -95,7 +94,8 @@ def exchange_slopes(
     drag: ReducedDrag | None,
     drag_directions: Any,
     time: Float[Array, ""],
-    size: tuple[int, int],
+    num_particles: int,
+    dimension: int,
 ) -> tuple[dict[str, Array], dict[str, Array]]:
     """Return derivatives of T, T_rot and collisions.
 
@@ -105,14 +105,14 @@ def exchange_slopes(
         drag: rates of drag; None without drag.
         drag_directions: directions in these rates, like `drag`.
         time: transformed time of the records.
-        size: N and d.
+        num_particles: N, of each replica.
+        dimension: d.
 
     Returns:
         The derivatives in time, and along the directions, as in `jaxgran.gradients.rule.Records`.
     """
-    n, d = size
     log_decay = jnp.zeros(2)
-    log_decay_slopes = jnp.zeros((1, 2))
+    log_decay_slopes = jnp.zeros((len(tangents.energies), 2))
     if drag is not None:
 
         def logarithms(drag: ReducedDrag) -> Array:
@@ -121,11 +121,14 @@ def exchange_slopes(
 
         log_decay, linear = jax.linearize(logarithms, drag)
         log_decay_slopes = jax.vmap(linear)(drag_directions)
-    slopes = {"collisions": 2 / n * tangents.collisions}
-    components = {"temperature": d, "rotational_temperature": NUM_SPIN_COMPONENTS[d]}
+    slopes = {"collisions": 2 / num_particles * tangents.collisions}
+    components = {
+        "temperature": dimension,
+        "rotational_temperature": NUM_SPIN_COMPONENTS[dimension],
+    }
     for k, (name, count) in enumerate(components.items()):
         if name in values:
-            energy = n * count / 2
+            energy = num_particles * count / 2
             by_energy = jnp.exp(2 * log_decay[k]) * tangents.energies[:, k] / energy
             slopes[name] = by_energy + 2 * log_decay_slopes[:, k, None] * values[name][None]
     elapsed = jnp.where(time > 0, time, 1.0)  # the last direction is the direction of time
@@ -140,9 +143,17 @@ MAX_KICK = 0.05
 def kick_growth(
     strength: Array, drag: ReducedDrag | None, start: Array, duration: Array, place: float
 ) -> Array:
-    """Return the growth of T by half of the kicks of a step, at its start (place 0) or end (1).
+    """Return the growth of T by half of the kicks of a step.
 
-    With drag a kick decays as a velocity does, and the start and the duration are transformed.
+    With drag it is the growth for the stored velocities u, which do not decay. A kick of v at a
+    time t is a kick of u that is ``exp(gamma t)`` times as large.
+
+    Args:
+        strength: growth of T in a unit of time.
+        drag: rates of drag; None without drag.
+        start: time at which the step begins; transformed with drag.
+        duration: of the step; transformed with drag. A negative one counts as 0.
+        place: where in the step the kicks are: 0 at its start, 1 at its end.
     """
     if drag is None:
         return strength * jnp.maximum(duration, 0.0) / 2
@@ -184,16 +195,6 @@ def random_kicks(
 def threefry_key(words: Array) -> PRNGKeyArray:
     """Return a threefry key from two 32-bit words; its numbers are the same under `jax.vmap`."""
     return jax.random.wrap_key_data(words, impl="threefry2x32")
-
-
-def random_words(key: PRNGKeyArray, count: int) -> UInt32[Array, "2 count"]:
-    """Return two random 32-bit words for each of `count` calls of threefry.
-
-    `jax.random.bits` makes one word of 32 bits of each call.
-    """
-    first, second = jax.random.key_data(key)
-    counters = jnp.arange(2 * count, dtype=jnp.uint32)
-    return threefry_2x32((first, second), counters).reshape(2, count)
 
 
 def surface_velocity(

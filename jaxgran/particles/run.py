@@ -6,29 +6,12 @@ derivatives; arrays that are too short end it in nan and a status. `run_on_host`
 numbers. It shows progress, writes checkpoints and trajectories, can be interrupted, and lengthens
 arrays that are too short.
 
-A run on the host consists of groups of replicas, the first axis of its state: one group of all
-replicas, which share arrays, or a group for each replica (`grouped`). Groups run one after the
-other on a device, and side by side on several CPU devices
-(`jax.config.update("jax_num_cpu_devices", 2)`), because XLA works through sorts, sums and scatters
-on one core. Each group has a key, a step, a neighbour list and arrays of its own: its numbers are
-independent of the number of devices.
-
-Small replicas of spheres on one device share one array, which saves the overhead of many short
-operations. They share every quantity that the state holds once: the length of blocks or windows,
-which the fastest spheres of all replicas decide, refined steps, and the skin, and thereby the times
-of new neighbour lists. Each replica is as accurate as alone, but not the same bit for bit, and so,
-after some collisions, another sample of the same gas. Replicas of `MIN_SPHERES_PER_RUN` spheres and
-more run one after the other even on one CPU device: one array does not save time any more. Replicas
-of DSMC share nothing but the array: each has its own steps and random numbers.
+A run on the host moves groups of replicas: see `jaxgran.particles.groups`.
 """
 
-import sys
-import threading
 import time
-from collections.abc import Callable, Hashable, Iterator, Sequence
-from concurrent.futures import Future
-from contextlib import contextmanager
-from functools import cache, partial
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -36,18 +19,24 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, PRNGKeyArray
-from tqdm import tqdm
 
 from jaxgran._utils import status
-from jaxgran._utils.tracing import fast_compilation, nan_where, near_map_limit
+from jaxgran._utils.tracing import nan_where
+from jaxgran._utils.waiting import block_until_ready
 from jaxgran.data import checkpoint
 from jaxgran.data.run_options import Run
 from jaxgran.data.trajectory import Sphere, Trajectory
 from jaxgran.gradients.rule import Records, Result
 from jaxgran.particles.capacity import Capacity
-from jaxgran.particles.dynamics import AbstractDynamics, AbstractProcess
+from jaxgran.particles.dynamics import AbstractDynamics, AbstractProcess, P
+from jaxgran.particles.groups import Groups, over_groups
+from jaxgran.particles.progress import (
+    compiling,
+    described_program,
+    drop_programs_near_limit,
+    progress_bar,
+)
 from jaxgran.particles.snapshot import Units, apply_save
 
 CHECKPOINT_SECONDS = 60.0
@@ -56,22 +45,8 @@ CHECKPOINT_SECONDS = 60.0
 MAX_ROWS_PER_PARTICLE = 100
 """Largest length of an array that is lengthened, in rows for each particle."""
 
-MIN_SPHERES_PER_RUN = 8192
-"""Smallest number of spheres in a replica with which replicas run one after the other.
-
-Run time of four replicas one after the other, over the run time of the same four in one array, on
-one core:
-
-    spheres     1000   2000   4096
-    hard         1.4    1.1    0.9
-    soft         1.4    1.3    1.1
-"""
-
 FULL = status.LIST_FULL.bit | status.CONTACTS_FULL.bit
 """Faults of arrays that are too short."""
-
-GROUPS = "groups"
-"""Name of the axis of groups of replicas, which devices share."""
 
 Stages = Sequence[tuple[AbstractProcess, Any]]
 """Processes that move a state in turn, each until a time."""
@@ -112,7 +87,9 @@ class Recorder(eqx.Module):
         return records._replace(saved=saved)
 
 
-def begun(dynamics: AbstractDynamics, start: Any, key: Any, fault: Any, directions: Any) -> Any:
+def initial_state(
+    dynamics: AbstractDynamics, start: Any, key: Any, fault: Any, directions: Any
+) -> Any:
     """Return the state at t = 0, with the faults of its start."""
     state = dynamics.initial(start, key, directions)
     return state._replace(status=state.status | fault)
@@ -130,6 +107,10 @@ def _move(process: AbstractProcess, state: Any, until: Array) -> Any:
 def start_traced(dynamics: AbstractDynamics, key: PRNGKeyArray) -> tuple[Any, Any]:
     """Return a random start and its faults inside JAX transformations."""
 
+    def each(function: Callable[[Any, Any], T], shared: Any, group: Any) -> T:
+        """Call a function for the only group, whose arrays have no axis of groups."""
+        return function(shared, group)
+
     def reach(stages: Stages, state: Any) -> Any:
         """Move a state by the first process, whose arrays suffice for all stages."""
         process, _ = stages[0]
@@ -139,7 +120,7 @@ def start_traced(dynamics: AbstractDynamics, key: PRNGKeyArray) -> tuple[Any, An
         )
         return reached
 
-    return dynamics.random_start(key, lambda call, *inputs: call(*inputs), reach)
+    return dynamics.random_start(key, each, reach)
 
 
 @eqx.filter_jit
@@ -169,61 +150,145 @@ def run_traced(
         state = _move(dynamics, state, until)
         return state, recorder(state)
 
-    state = begun(dynamics, start, key, fault, directions)
+    state = initial_state(dynamics, start, key, fault, directions)
     state, records = jax.lax.scan(record_at, state, times)
     fault = jnp.bitwise_or.reduce(state.status, axis=None)
     return Result(records, dynamics.to_lab_frame(state), fault)
 
 
-class Groups(NamedTuple):
-    """Groups of replicas of a run on the host.
-
-    Attributes:
-        number: number of groups.
-        devices: CPU devices that share the groups; () for the default device alone.
-    """
-
-    number: int
-    devices: tuple[Any, ...] = ()
-
-    @property
-    def rows(self) -> np.ndarray:
-        """Groups that are run: the last one is repeated until devices have the same number."""
-        shared = max(len(self.devices), 1)
-        return np.minimum(np.arange(-(-self.number // shared) * shared), self.number - 1)
-
-    def keys(self, key: PRNGKeyArray) -> Array:
-        """Return a key for each group.
-
-        A single group has `key`; group k of several has ``fold_in(key, k)``.
-        """
-        if self.number == 1:
-            return key[None]
-        return jax.vmap(partial(jax.random.fold_in, key))(self.rows)
-
-    def split(self, arrays: Any) -> Any:
-        """Return arrays of all replicas with a first axis of groups; None remains None."""
-        rows = self.rows
-        return jax.tree.map(lambda x: x.reshape(self.number, -1, x.shape[-1])[rows], arrays)
+# `over_groups` keeps one compiled program for each function. So these are functions of the module:
+# a lambda or a partial, made anew in each run, would be compiled in each run.
 
 
-def grouped(replicas: int, spheres: int) -> Groups:
-    """Return the groups of replicas: one of all of them, or one of each on CPU devices.
+def _with_new_velocities(dynamics: AbstractDynamics, group: tuple[Any, Any]) -> Any:
+    return dynamics.with_new_velocities(*group)
 
-    There is one group on one device where each replica has less than `MIN_SPHERES_PER_RUN` spheres,
-    on an accelerator, and if the user has chosen a device by `jax.default_device`.
+
+def _begin(shared: tuple[AbstractDynamics, Any], group: tuple[Any, Any, Any]) -> Any:
+    dynamics, directions = shared
+    return initial_state(dynamics, *group, directions)
+
+
+def _observe(recorder: Recorder, state: Any) -> Records:
+    return recorder(state)
+
+
+def _to_lab_frame(dynamics: AbstractDynamics, state: Any) -> Any:
+    return dynamics.to_lab_frame(state)
+
+
+def _advance(shared: tuple[AbstractProcess, Any], state: Any) -> tuple[Any, Array]:
+    process, until = shared
+    state = process.advance(state, until)
+    return state, process.unfinished(state, until)
+
+
+_LENGTHENED: dict[Capacity, Capacity] = {}
+"""Lengthened arrays by the original ones. Later runs begin with them, and neither fail on the way
+to them nor compile again. Results do not depend on it."""
+
+
+class HostLoop:
+    """A loop of Python around compiled code, for all groups of replicas.
 
     Args:
-        replicas: number of replicas.
-        spheres: number in each replica, 0 for DSMC.
+        dynamics: of a group.
+        groups: of the replicas.
+        progress: whether to show progress on a terminal.
     """
-    chosen = jax.config.jax_default_device  # type: ignore[attr-defined]
-    if replicas == 1 or jax.default_backend() != "cpu" or chosen is not None:
-        return Groups(1)
-    devices = tuple(jax.local_devices()[:replicas])
-    if len(devices) > 1:
-        return Groups(replicas, devices)
-    return Groups(replicas if spheres >= MIN_SPHERES_PER_RUN else 1)
+
+    def __init__(self, dynamics: AbstractDynamics, groups: Groups, progress: bool):
+        self.dynamics = dynamics
+        self.groups = groups
+        self.progress = progress
+
+    def each(self, function: Callable[[Any, Any], T], shared: Any, group: Any) -> T:
+        """Call a function for each group in compiled code that runs for a short time.
+
+        Args:
+            function: of the module, see `over_groups`.
+            shared: its first input, the same for all groups.
+            group: its second input, with a first axis of groups.
+        """
+        return over_groups(function, self.groups.devices, short=True)(shared, group)
+
+    def time(self, state: Any) -> float:
+        """Return the time that all groups have reached."""
+        return float(np.min(np.asarray(state.time)))
+
+    def reach(self, stages: Stages, state: Any) -> Any:
+        """Move states by some processes in turn, each until a time."""
+        end = float(np.asarray(stages[-1][1]))
+        with progress_bar(end, 0.0, self.progress and end > 0, "equilibrating") as bar:
+            for process, until in stages:
+                busy = True
+                while busy:
+                    state, busy = self.call(process, state, until)
+                    bar.update(self.time(state) - bar.n)
+        return state
+
+    def call(self, process: AbstractProcess, state: Any, until: Any) -> tuple[Any, bool]:
+        """Call compiled code once, and lengthen arrays where necessary.
+
+        Returns:
+            The states, and whether any of them has not reached the time.
+        """
+        lengthened = _with_lengthened_arrays(process)
+        until = np.asarray(until, state.time.dtype)
+        if process.calls_host:
+            moved = _advance_one_by_one(lengthened, until, state)
+        else:
+            # Only the equilibration uses a process of another kind or other lengths: it runs for a
+            # short time.
+            kind = type(process), process.capacity
+            short = kind != (type(self.dynamics), self.dynamics.capacity)
+            program = over_groups(_advance, self.groups.devices, short)
+            described = described_program(lengthened, state)
+            drop_programs_near_limit(described)
+            with compiling(described, self.progress):
+                moved = program((lengthened, until), state)
+        state, busy = block_until_ready(moved)
+        checkpoint.stop_if_terminated()
+        fault = np.asarray(state.status)
+        is_full = (fault & FULL) > 0
+        if np.any(is_full) and _lengthen(process, state):
+            repeated = np.where(is_full, status.OK, fault)
+            return state._replace(status=jnp.asarray(repeated)), True
+        return state, bool(np.any(busy))
+
+
+def _advance_one_by_one(
+    process: AbstractProcess, until: np.ndarray, state: Any
+) -> tuple[Any, Array]:
+    """Advance the groups of a process that calls the host, one after the other."""
+    groups = [jax.tree.map(lambda x, k=k: x[k], state) for k in range(len(state.time))]
+    moved = [_advance((process, until), group) for group in groups]
+    return jax.tree.map(lambda *x: jnp.stack(x), *moved)
+
+
+def _with_lengthened_arrays(process: P) -> P:
+    """Return a process with arrays of the largest length that any run of it has needed."""
+    if process.capacity is None:
+        return process
+    return process.with_capacity(_LENGTHENED.get(process.capacity, process.capacity))
+
+
+def _lengthen(process: AbstractProcess, state: Any) -> bool:
+    """Lengthen the arrays of all later calls of a process; return whether that is possible.
+
+    Args:
+        process: with the original lengths.
+        state: of all groups, for which arrays were too short.
+    """
+    capacity = process.capacity
+    if capacity is None:
+        return False
+    needed = np.max(np.asarray(state.needed), axis=0).tolist()
+    replicas, num_particles, _ = process.shape
+    if max(needed) > MAX_ROWS_PER_PARTICLE * replicas * num_particles:
+        return False
+    _LENGTHENED[capacity] = _LENGTHENED.get(capacity, capacity).grown(needed)
+    return True
 
 
 class _Reached(NamedTuple):
@@ -301,8 +366,8 @@ def run_on_host(
     particles = loop.each(_to_lab_frame, dynamics, reached.state)
     faults = np.asarray(reached.state.status)
     return Result(
-        records=_without_groups(reached.records, groups),
-        particles=jax.tree.map(lambda x: _joined(np.asarray(x), 0, groups), particles),
+        records=groups.join_records(reached.records),
+        particles=groups.join(particles),
         status=jnp.asarray(np.bitwise_or.reduce(faults, axis=None)),
     )
 
@@ -314,31 +379,31 @@ def _blank_start(dynamics: AbstractDynamics, groups: Groups, dtype: Any) -> tupl
 
 
 def _first_state(
-    loop: "HostLoop", start: Any, keys: Array, directions: Any, known: dict[str, Any] | None
+    loop: HostLoop, start: Any, keys: Array, directions: Any, starts: dict[str, Any] | None
 ) -> Any:
     """Return the state of all groups at t = 0, of a random start where none is given."""
     fault: Any = np.zeros(len(loop.groups.rows), np.int32)
     if start is None:
-        start, fault = _random_start(loop, keys, known)
+        start, fault = _random_start(loop, keys, starts)
     return loop.each(_begin, (loop.dynamics, directions), (start, keys, fault))
 
 
-def _random_start(loop: "HostLoop", keys: Array, known: dict[str, Any] | None) -> tuple[Any, Any]:
+def _random_start(loop: HostLoop, keys: Array, starts: dict[str, Any] | None) -> tuple[Any, Any]:
     """Return a random start and its faults: a new one, or a known one with new velocities."""
     dynamics = loop.dynamics
-    if known is None:
+    if starts is None:
         return dynamics.random_start(keys, loop.each, loop.reach)
     described = checkpoint.describe_run(equilibrium=dynamics.equilibrium, groups=len(keys))
     name = str(described)
-    if name not in known:
-        known[name] = dynamics.random_start(keys, loop.each, loop.reach)
-        return known[name]
-    start, fault = known[name]
+    if name not in starts:
+        starts[name] = dynamics.random_start(keys, loop.each, loop.reach)
+        return starts[name]
+    start, fault = starts[name]
     return loop.each(_with_new_velocities, dynamics, (start, keys)), fault
 
 
 def _record_all(
-    loop: "HostLoop",
+    loop: HostLoop,
     observe: Callable[[Any], Records],
     times: Float[Array, "times"],
     reached: _Reached,
@@ -374,7 +439,8 @@ def _record_all(
                     if time.monotonic() - last_save > CHECKPOINT_SECONDS:
                         save(_Reached(num_done, state, records))
                         last_save = time.monotonic()
-                for values, x in zip(*map(jax.tree.leaves, (records, observe(state))), strict=True):
+                observed = jax.tree.leaves(observe(state))
+                for values, x in zip(jax.tree.leaves(records), observed, strict=True):
                     values[num_done] = x
                 write(num_done, state)
                 num_done += 1
@@ -383,152 +449,6 @@ def _record_all(
             save(_Reached(num_done, state, records))
             raise
     return _Reached(num_done, state, records)
-
-
-def _with_new_velocities(dynamics: AbstractDynamics, group: tuple[Any, Any]) -> Any:
-    return dynamics.with_new_velocities(*group)
-
-
-def _begin(shared: tuple[AbstractDynamics, Any], group: tuple[Any, Any, Any]) -> Any:
-    dynamics, directions = shared
-    return begun(dynamics, *group, directions)
-
-
-def _observe(recorder: Recorder, state: Any) -> Records:
-    return recorder(state)
-
-
-def _to_lab_frame(dynamics: AbstractDynamics, state: Any) -> Any:
-    return dynamics.to_lab_frame(state)
-
-
-def _advance(shared: tuple[AbstractProcess, Any], state: Any) -> tuple[Any, Array]:
-    process, until = shared
-    state = process.advance(state, until)
-    return state, process.unfinished(state, until)
-
-
-_LENGTHENED: dict[Capacity, Capacity] = {}
-"""Lengthened arrays by the original ones. Later runs begin with them, and neither fail on the way
-to them nor compile again. Results do not depend on it."""
-
-
-class HostLoop:
-    """A loop of Python around compiled code, for all groups of replicas.
-
-    Args:
-        dynamics: of a group.
-        groups: of the replicas.
-        progress: whether to show progress on a terminal.
-    """
-
-    def __init__(self, dynamics: AbstractDynamics, groups: Groups, progress: bool):
-        self.dynamics = dynamics
-        self.groups = groups
-        self.progress = progress
-
-    def each(self, function: Callable[[Any, Any], T], shared: Any, group: Any) -> T:
-        """Call a short function for each group: with an input of all and one of this group."""
-        return over_groups(function, self.groups.devices, short=True)(shared, group)
-
-    def time(self, state: Any) -> float:
-        """Return the time that all groups have reached."""
-        return float(np.min(np.asarray(state.time)))
-
-    def reach(self, stages: Stages, state: Any) -> Any:
-        """Move states by some processes in turn, each until a time."""
-        end = float(np.asarray(stages[-1][1]))
-        with progress_bar(end, 0.0, self.progress and end > 0, "equilibrating") as bar:
-            for process, until in stages:
-                busy = True
-                while busy:
-                    state, busy = self.call(process, state, until)
-                    bar.update(self.time(state) - bar.n)
-        return state
-
-    def call(self, process: AbstractProcess, state: Any, until: Any) -> tuple[Any, bool]:
-        """Call compiled code once, and lengthen arrays where necessary.
-
-        Returns:
-            The states, and whether any of them has not reached the time.
-        """
-        capacity: Capacity | None = process.capacity
-        longer = capacity and _LENGTHENED.get(capacity, capacity)
-        lengthened = process if longer is None else process.with_capacity(longer)
-        until = np.asarray(until, state.time.dtype)
-        if process.calls_host:
-            shared = lengthened, until
-            each = [
-                _advance(shared, jax.tree.map(lambda x, k=k: x[k], state))
-                for k in range(len(state.time))
-            ]
-            moved = jax.tree.map(lambda *x: jnp.stack(x), *each)
-        else:
-            # No other part of the run has such a program: it runs for a short time.
-            kind = type(process), capacity
-            short = kind != (type(self.dynamics), self.dynamics.capacity)
-            program = over_groups(_advance, self.groups.devices, short)
-            with compiling(described_program(lengthened, state), self.progress):
-                moved = program((lengthened, until), state)
-        state, busy = block_until_ready(moved)
-        checkpoint.stop_if_terminated()
-        fault = np.asarray(state.status)
-        is_full = (fault & FULL) > 0
-        if capacity is not None and longer is not None and np.any(is_full):
-            needed = np.max(np.asarray(state.needed), axis=0).tolist()
-            replicas, num_particles, _ = process.shape
-            if max(needed) <= MAX_ROWS_PER_PARTICLE * replicas * num_particles:
-                _LENGTHENED[capacity] = longer.grown(needed)
-                repeated = np.where(is_full, status.OK, fault)
-                return state._replace(status=jnp.asarray(repeated)), True
-        return state, bool(np.any(busy))
-
-
-@cache
-def over_groups(
-    function: Callable[[Any, Any], T],
-    devices: tuple[Any, ...],
-    short: bool = False,
-) -> Callable[[Any, Any], T]:
-    """Return a compiled function that calls a function for each group of replicas.
-
-    Args:
-        function: of an input that all groups share, and of the input of one group.
-        devices: that share the groups; () for the default device.
-        short: whether the program runs for a short time. It is then compiled in three fifths of the
-            time, and runs 5 to 40 % slower.
-    """
-
-    def call(shared: Any, groups: Any) -> T:
-        return jax.lax.map(partial(function, shared), groups)
-
-    options = fast_compilation(jax.default_backend()) if short else {}
-    if devices:
-        # With check_vma, shard_map would require all loops to declare the axis of groups.
-        specs = PartitionSpec(), PartitionSpec(GROUPS)
-        mesh = Mesh(np.array(devices), (GROUPS,))
-        call = jax.shard_map(call, mesh=mesh, in_specs=specs, out_specs=specs[1], check_vma=False)
-        # XLA would divide the operations of each group among threads of all cores, which then wait
-        # for each other: two replicas of DSMC would take 15 to 20 % longer.
-        options = options | {"xla_cpu_multi_thread_eigen": False}
-    return jax.jit(call, compiler_options=options)
-
-
-def _joined(x: np.ndarray, axis: int, groups: Groups) -> Array:
-    """Return an array in which an axis of groups is joined with the next axis, of replicas."""
-    kept = np.take(x, np.arange(groups.number), axis)
-    joined = kept.shape[axis] * kept.shape[axis + 1]  # there may be no directions: not -1
-    shape = *x.shape[:axis], joined, *x.shape[axis + 2 :]
-    return jnp.asarray(kept.reshape(shape))
-
-
-def _without_groups(records: Any, groups: Groups) -> Records:
-    """Return the records of all replicas; their axes are times and groups."""
-    others = records._replace(tangents={})
-    joined = jax.tree.map(lambda x: _joined(x, 1, groups), others)
-    # Directions come before replicas.
-    tangents = jax.tree.map(lambda x: _joined(np.moveaxis(x, 1, 2), 2, groups), records.tangents)
-    return joined._replace(tangents=tangents)
 
 
 def _writer(
@@ -546,79 +466,7 @@ def _writer(
 
     def write(k: int, state: Any) -> None:
         arrays = loop.each(_to_lab_frame, dynamics, state)
-        joined = jax.tree.map(lambda x: _joined(np.asarray(x), 0, groups), arrays)
-        particles = units.to_particles(replicas, *joined)
+        particles = units.to_particles(replicas, *groups.join(arrays))
         trajectory.write(k, float(seconds[k]), particles, sphere)
 
     return write
-
-
-def progress_bar(end: float, now: float, progress: bool, label: str | None = None) -> tqdm:
-    """Return a bar of the time of a run, which appears on a terminal after some seconds."""
-    return tqdm(
-        total=end,
-        initial=now,
-        disable=None if progress else True,
-        delay=3,
-        desc=label,
-        bar_format="{l_bar}{bar}| {elapsed} elapsed, {remaining} left{postfix}",
-    )
-
-
-_COMPILED: set[Hashable] = set()
-
-
-def described_program(process: AbstractProcess, state: Any) -> Hashable:
-    """Return a key of the compiled program: structure, shapes and dtype of its arguments."""
-    leaves, structure = jax.tree.flatten((process, state))
-    return structure, *(x.shape for x in leaves), leaves[-1].dtype
-
-
-@contextmanager
-def compiling(program: Hashable, progress: bool) -> Iterator[None]:
-    """Show "compiling ..." on a terminal during the first call of a program in this process.
-
-    Without `progress` nothing is shown. The progress bar follows. Near the limit of memory maps all
-    programs of this process are dropped before.
-    """
-    text = "compiling ..."
-    is_new = program not in _COMPILED
-    if is_new and near_map_limit():
-        jax.clear_caches()
-        _COMPILED.clear()
-    _COMPILED.add(program)
-    shown = is_new and progress and sys.stderr.isatty()
-    if shown:
-        print(f"\r{text}", end="", file=sys.stderr, flush=True)
-    try:
-        yield
-    finally:
-        if shown:
-            print(f"\r{' ' * len(text)}\r", end="", file=sys.stderr, flush=True)
-
-
-def block_until_ready(arrays: T) -> T:
-    """Return arrays once they are computed; an interruption ends the waiting at once.
-
-    Polling whether they are ready would take 3 to 8 % of a run's time.
-    """
-    return in_thread(lambda: jax.block_until_ready(arrays))
-
-
-def in_thread(function: Callable[[], T]) -> T:
-    """Return the result of a function that is called in a new thread.
-
-    An interruption from the keyboard ends the waiting at once; the thread, which Python cannot end,
-    then goes on in the background. JAX transformations and JAX configuration of the calling thread
-    do not apply in the new one.
-    """
-    future: Future[T] = Future()
-
-    def call() -> None:
-        try:
-            future.set_result(function())
-        except BaseException as error:
-            future.set_exception(error)
-
-    threading.Thread(target=call, daemon=True).start()
-    return future.result()

@@ -8,13 +8,21 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxgran._utils.formatting import format_quantity, text_table
+from jaxgran._utils.tracing import any_traced
 from jaxgran._utils.validation import POSITIVE, Domain, UserNumber, checked_int, float_array
-from jaxgran.scene import elements, laws
+from jaxgran.scene import laws
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME, ELASTIC_OVERLAP
+from jaxgran.scene.elements import (
+    Frictional,
+    Rough,
+    StokesDrag,
+    Walls,
+    WhiteNoise,
+    check_elements,
+)
 from jaxgran.scene.geometry import CLOSE_PACKING, contact_value, sphere_surface
 from jaxgran.scene.parameter_fields import (
     ParameterField,
@@ -56,10 +64,10 @@ def _without_function_leaf(leaf: Any) -> Any:
 
 
 ELEMENTS: dict[str, tuple[type, ...]] = {
-    "surface": (elements.Rough, elements.Frictional),
-    "container": (elements.Walls,),
-    "drag": (elements.StokesDrag,),
-    "drive": (elements.WhiteNoise,),
+    "surface": (Rough, Frictional),
+    "container": (Walls,),
+    "drag": (StokesDrag,),
+    "drive": (WhiteNoise,),
 }
 """Fields of `Gas` that are elements, with their classes."""
 
@@ -135,10 +143,10 @@ class Gas(eqx.Module):
     diameter_sd: Float[Array, ""] | None = eqx.field(
         converter=optional_number_named("diameter_sd"), default=None, kw_only=True
     )
-    surface: elements.Rough | elements.Frictional | None = optional_element("surface")
-    container: elements.Walls | None = optional_element("container")
-    drag: elements.StokesDrag | None = optional_element("drag")
-    drive: elements.WhiteNoise | None = optional_element("drive")
+    surface: Rough | Frictional | None = optional_element("surface")
+    container: Walls | None = optional_element("container")
+    drag: StokesDrag | None = optional_element("drag")
+    drive: WhiteNoise | None = optional_element("drive")
 
     def __check_init__(self):
         if self.dimension not in CLOSE_PACKING or isinstance(self.dimension, bool | float):
@@ -154,13 +162,11 @@ class Gas(eqx.Module):
             if getattr(self, name) is not None:
                 self.domains[name].check(name, getattr(self, name), ADVICE[name])
         self.check_sizes()
-        elements.check_elements(self)
+        check_elements(self)
 
     def check_sizes(self) -> None:
         """Raise ValueError if diameters differ so much that the theory of them does not hold."""
-        if self.diameter_sd is None or any(
-            isinstance(x, Tracer) for x in (self.diameter_sd, self.diameter)
-        ):
+        if self.diameter_sd is None or any_traced(self.diameter_sd, self.diameter):
             return
         spread = float(np.max(np.asarray(self.diameter_sd) / np.asarray(self.diameter)))
         if not is_allowed_spread(spread):
@@ -192,10 +198,7 @@ class Gas(eqx.Module):
         Raises:
             ValueError: for an unknown name.
         """
-        fields = self._parameter_fields
-        if name not in fields:
-            raise ValueError(f"Gas has no parameter {name!r}; it has {', '.join(fields)}")
-        return fields[name].get(self)
+        return self._field_named(name).get(self)
 
     def replace(self, **values: UserNumber) -> "Gas":
         """Return a copy with new values of some parameters.
@@ -208,16 +211,41 @@ class Gas(eqx.Module):
         Raises:
             ValueError: for an unknown name or a value outside its range.
         """
-        fields = self._parameter_fields
+        fields = [self._field_named(name) for name in values]
         arrays = []
-        for name, value in values.items():
-            self.value(name)
-            fields[name].domain.check(name, value)
+        for field, (name, value) in zip(fields, values.items(), strict=True):
+            field.domain.check(name, value)
             arrays.append(float_array(value, name, unit_of(name)))
+        return eqx.tree_at(lambda module: [field.get(module) for field in fields], self, arrays)
 
-        return eqx.tree_at(
-            lambda module: [fields[name].get(module) for name in values], self, arrays
-        )
+    def with_arrays(self, values: dict[str, Any]) -> "Gas":
+        """Return a copy with new values of some parameters, whose ranges are not checked.
+
+        Fits use it in each step. Elsewhere use `replace`, which checks.
+
+        Args:
+            values: new values, by name of the parameter: arrays of JAX or NumPy of any shape.
+
+        Raises:
+            ValueError: for an unknown name.
+
+        >>> gas.with_arrays({"temperature": jnp.array([0.01, 0.02])}).temperature.shape
+        (2,)
+        """
+        leaves, structure = jax.tree.flatten(self)
+        positions = structure.unflatten(range(len(leaves)))
+        for name, value in values.items():
+            leaves[self._field_named(name).get(positions)] = value
+        changed = structure.unflatten(leaves)
+        # Its parameters have the same places: to find them again takes as long as all else here.
+        vars(changed)["_parameter_fields"] = self._parameter_fields
+        return changed
+
+    def _field_named(self, name: str) -> ParameterField:
+        fields = self._parameter_fields
+        if name not in fields:
+            raise ValueError(f"Gas has no parameter {name!r}; it has {', '.join(fields)}")
+        return fields[name]
 
     @cached_property
     def _parameter_fields(self) -> dict[str, ParameterField]:
@@ -241,7 +269,7 @@ class Gas(eqx.Module):
         """
         names = (*ELEMENTS, "diameter_sd")
         given = [name for name in names if getattr(self, name) is not None]
-        if isinstance(self.surface, elements.Frictional):
+        if isinstance(self.surface, Frictional):
             given[given.index("surface")] = "friction"
         return tuple(given)
 
@@ -253,6 +281,7 @@ class Gas(eqx.Module):
         """
         if all(jnp.shape(leaf) == () for leaf in jax.tree.leaves(self)):
             return
+        # The arrays of a law that is a network, and the sides of walls, may have axes.
         parts = law_fields(self.law).keys() - self.law.domains.keys()
         lists = (*self.law.lists, *parts, "wall_side")
         for name in self.domains:
@@ -270,11 +299,10 @@ class Gas(eqx.Module):
         title = f"Gas of {type(self.law).__name__} spheres, d = {self.dimension}{parts}"
         units = [(name, PARAMETER_UNITS.get(name, "")) for name in self.domains]
         rows = [(name, format_quantity(self.value(name), unit)) for name, unit in units]
-        leaves = jax.tree.leaves(self)
-        if any(isinstance(leaf, Tracer) or np.ndim(leaf) > 0 for leaf in leaves):
+        if any_traced(self) or any(np.ndim(leaf) > 0 for leaf in jax.tree.leaves(self)):
             return text_table(title, rows)
         rows.append(("mean free time", format_quantity(self.mean_free_time, "s")))
-        if hasattr(self.law, "dissipative_constant"):
+        if isinstance(self.law, laws.Viscoelastic):
             rows.append(("beta", format_quantity(self.thermal_beta, "at v = sqrt(2 T_0)")))
             rows.append(("t_c/tau_c", format_quantity(self.contact_fraction)))
         return text_table(title, rows)

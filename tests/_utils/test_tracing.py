@@ -8,7 +8,7 @@ import pytest
 
 import jaxgran
 from jaxgran._utils import tracing
-from jaxgran.particles import run as particle_run
+from jaxgran.particles import progress
 from tests.beads import glass_beads
 
 GAS = glass_beads(0.3, packing_fraction=0.1)
@@ -26,7 +26,8 @@ def test_programs_are_dropped_before_the_limit_of_memory_maps(monkeypatch):
     if not Path("/proc/self/maps").exists():
         pytest.skip("not Linux")
     for _ in range(2):
-        with particle_run.compiling("a program", False):
+        progress.drop_programs_near_limit("a program")
+        with progress.compiling("a program", False):
             pass
     assert len(cleared) == 1
 

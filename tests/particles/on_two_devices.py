@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.particles.run import Groups, grouped
+from jaxgran.particles.groups import Groups, grouped
 from tests.beads import assert_same, glass_beads, lattice, soft_beads
 
 TIMES = jnp.array([0.01, 0.03])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.particles.run import MIN_SPHERES_PER_RUN, Groups, grouped
+from jaxgran.particles.groups import MIN_SPHERES_PER_RUN, Groups, grouped
 from tests.beads import glass_beads, lattice
 
 
@@ -26,6 +26,16 @@ def test_devices_have_the_same_number_of_groups():
     np.testing.assert_array_equal(Groups(3).rows, [0, 1, 2])
     np.testing.assert_array_equal(Groups(3, ("a", "b")).rows, [0, 1, 2, 2])
     np.testing.assert_array_equal(Groups(4, ("a", "b")).rows, [0, 1, 2, 3])
+
+
+@pytest.mark.parametrize("groups", [Groups(1), Groups(3), Groups(3, ("a", "b"))])
+def test_joined_groups_are_the_arrays_that_were_split(groups):
+    position = np.arange(36.0).reshape(18, 2)  # of three replicas
+    split = groups.split({"position": position, "spin": None})
+    assert split["position"].shape == (len(groups.rows), 18 // groups.number, 2)
+    joined = groups.join(split)
+    np.testing.assert_array_equal(joined["position"], position)
+    assert joined["spin"] is None
 
 
 @pytest.mark.slow

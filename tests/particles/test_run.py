@@ -1,8 +1,6 @@
-"""The loop on the host: resumption, the bar, failures, arrays that grow, and interruption."""
+"""The loop on the host: resumption, the bar, failures, and arrays that grow."""
 
 import io
-import signal
-import time
 from contextlib import redirect_stderr
 from typing import NamedTuple
 
@@ -16,10 +14,11 @@ from tqdm import tqdm
 import jaxgran
 from jaxgran._utils import status
 from jaxgran.gradients.rule import Records
-from jaxgran.particles import run
+from jaxgran.particles import progress, run
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import AbstractDynamics
-from jaxgran.particles.run import Groups, Recorder, compiling, run_on_host, run_traced
+from jaxgran.particles.groups import Groups
+from jaxgran.particles.run import Recorder, run_on_host, run_traced
 from jaxgran.particles.snapshot import Units
 from tests.beads import assert_same, glass_beads
 
@@ -187,7 +186,9 @@ class Terminal(io.StringIO):
 @pytest.fixture
 def eager(monkeypatch):
     """Bars are drawn at once."""
-    monkeypatch.setattr(run, "tqdm", lambda **kw: tqdm(**(kw | {"delay": 0, "mininterval": 0})))
+    monkeypatch.setattr(
+        progress, "tqdm", lambda **kw: tqdm(**(kw | {"delay": 0, "mininterval": 0}))
+    )
 
 
 def shown(stream, capsys, **options):
@@ -215,51 +216,20 @@ def test_the_bar_goes_on_where_the_run_was(tmp_path, eager, capsys, monkeypatch)
 
 
 def test_compiling_is_said_until_the_program_runs_where_a_bar_would_be():
-    with redirect_stderr(Terminal()) as stream, compiling(object(), progress=True):
+    with redirect_stderr(Terminal()) as stream, progress.compiling(object(), progress=True):
         assert stream.getvalue() == "\rcompiling ..."
     assert stream.getvalue().split("\r")[-2:] == [" " * 13, ""]  # removed, for the bar
-    for stream, progress in ((Terminal(), False), (io.StringIO(), True)):
-        with redirect_stderr(stream), compiling(object(), progress):
+    for stream, is_wanted in ((Terminal(), False), (io.StringIO(), True)):
+        with redirect_stderr(stream), progress.compiling(object(), is_wanted):
             pass
         assert stream.getvalue() == ""
 
 
 def test_a_run_says_that_it_compiles_once(monkeypatch):
-    monkeypatch.setattr(run, "_COMPILED", set())
+    monkeypatch.setattr(progress, "_COMPILED", set())
     said, model = [], jaxgran.DSMC(64, replicas=2)
     for _ in range(2):
         with redirect_stderr(Terminal()) as stream:
             jaxgran.cool(glass_beads(), [1e-3], model=model)
         said.append("compiling ..." in stream.getvalue())
     assert said == [True, False]
-
-
-@jax.jit
-def some_seconds():
-    # Not of scalars: JAX does not return before such programs have ended.
-    return jax.lax.fori_loop(0, 3000, lambda i, x: 0.99 * x @ x, jnp.eye(300))
-
-
-@pytest.mark.parametrize(
-    "wait",
-    [
-        lambda: run.in_thread(lambda: time.sleep(20)),
-        lambda: run.block_until_ready(some_seconds()),
-    ],
-)
-def test_waiting_can_be_interrupted(wait):
-    some_seconds.lower().compile()
-
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    old = signal.signal(signal.SIGALRM, interrupt)
-    began = time.monotonic()
-    try:
-        signal.setitimer(signal.ITIMER_REAL, 0.3)
-        with pytest.raises(KeyboardInterrupt):
-            wait()
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, old)
-    assert time.monotonic() - began < 1.5

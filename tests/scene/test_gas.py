@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxgran
 from tests.beads import glass_beads, hard_gas
 
 
@@ -94,6 +95,32 @@ def test_repr_of_a_gas_has_units():
     assert "dissipative_constant" in words and "m^2/s^2" in words and "f64[]" not in words
     assert f"{float(gas.mean_free_time):.4g} s" in words
     assert words.startswith("Gas of Viscoelastic spheres, d = 3")
+
+
+class Dissipating(jaxgran.extend.RestitutionLaw):
+    """A law of a user, with a field of the name that the viscoelastic law has, too."""
+
+    dissipative_constant: float
+
+    def restitution(self, normal_speed):
+        return 1 / (1 + self.dissipative_constant * normal_speed)
+
+
+def test_repr_of_a_law_of_a_user_with_a_dissipative_constant():
+    words = repr(dataclasses.replace(glass_beads(), law=Dissipating(2.0)))
+    assert words.startswith("Gas of Dissipating spheres, d = 3")
+    assert "dissipative_constant  2" in words and "beta" not in words
+
+
+def test_arrays_of_a_copy_have_any_shape_and_the_names_of_the_gas():
+    gas = glass_beads()
+    A = np.array([1e-6, 1.0])  # the last one is not allowed, which only `replace` checks
+    changed = gas.with_arrays({"dissipative_constant": A})
+    assert changed.dissipative_constant is A
+    assert changed.parameters.keys() == gas.parameters.keys()
+    assert float(gas.dissipative_constant) != A[0]
+    with pytest.raises(ValueError, match="Gas has no parameter 'viscosity'"):
+        gas.with_arrays({"viscosity": A})
 
 
 def test_repr_marks_batches_and_traced_values():

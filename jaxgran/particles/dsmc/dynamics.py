@@ -24,6 +24,7 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.extend.random import threefry_2x32
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, UInt32
 
 from jaxgran._utils import status
@@ -49,7 +50,6 @@ from jaxgran.particles.elements import (
     exchange_slopes,
     kick_growth,
     random_kicks,
-    random_words,
     tangential_impulse,
     threefry_key,
 )
@@ -727,6 +727,16 @@ class DSMCDynamics(AbstractDynamics):
         return start.tangents.after(jnp.stack(energies), values, by_direction, by_scale, collisions)
 
 
+def random_words(key: PRNGKeyArray, count: int) -> UInt32[Array, "2 count"]:
+    """Return two random 32-bit words for each of `count` calls of threefry.
+
+    `jax.random.bits` makes one word of 32 bits of each call.
+    """
+    first, second = jax.random.key_data(key)
+    counters = jnp.arange(2 * count, dtype=jnp.uint32)
+    return threefry_2x32((first, second), counters).reshape(2, count)
+
+
 @jax.jit
 def dsmc_records(dynamics: DSMCDynamics, state: DSMCState) -> Records:
     """Return the records of a state."""
@@ -757,6 +767,6 @@ def dsmc_records(dynamics: DSMCDynamics, state: DSMCState) -> Records:
     if tangents is None:
         return Records(values, {}, {})
     rates, slopes = exchange_slopes(
-        values, tangents, scene.drag, tangents.directions.drag, state.time, (n, d)
+        values, tangents, scene.drag, tangents.directions.drag, state.time, n, d
     )
     return Records(values, rates, slopes)

@@ -1,7 +1,8 @@
 """Hard spheres: instantaneous impacts, predicted and executed in windows of time.
 
 - `prediction`: the next impact of each pair, on walls too, and until when each path is final.
-- `impacts`: the scene in reduced units, the effect of impacts, and their execution in a window.
+- `impacts`: the effect of impacts, and its derivatives.
+- `window`: the execution of all impacts of a window.
 - `dynamics`: the sequence of windows, with a drive, tangents and records.
 
 May import the modules directly under `particles`, except for `run`, and the layers below

@@ -27,8 +27,8 @@ from jaxgran.particles.elements import (
     random_kicks,
     threefry_key,
 )
-from jaxgran.particles.hard.impacts import MAX_ROUNDS, ImpactWork, execute_impacts
 from jaxgran.particles.hard.prediction import ImpactCandidates, PairRows, Paths, first_impacts
+from jaxgran.particles.hard.window import MAX_ROUNDS, WindowProgress, execute_impacts
 from jaxgran.particles.neighbours.pairs import Pairs, wrap
 from jaxgran.particles.neighbours.selection import select_members
 from jaxgran.particles.spheres import (
@@ -223,19 +223,19 @@ class HardDynamics(AbstractSphereDynamics):
         kicked = self._apply_drive(old, duration, 0.0)
         bound = SPEED_MARGIN * bound_factor * fastest(kicked.velocity, self.replicas)
         candidates = self._select_candidates(kicked, pairs, duration, bound)
-        work = execute_impacts(
+        progress = execute_impacts(
             kicked, listed, candidates, scene, duration, self.contact_time, self.all_elastic
         )
         member_bound = bound[jnp.minimum(candidates.replica, self.replicas - 1)]
-        too_fast = jnp.any(work.max_speed2 > member_bound**2)
-        new = self._state_after_window(kicked, candidates, work, duration)
+        too_fast = jnp.any(progress.max_speed2 > member_bound**2)
+        new = self._state_after_window(kicked, candidates, progress, duration)
         new = self._apply_drive(new, duration, 1.0)
         new = advance_to_end(new, duration, end, is_last)
 
         distance2 = jnp.max(jnp.sum((new.position - listed) ** 2, -1))
-        exceeded = jnp.maximum(distance2, jnp.max(work.max_distance2)) > (0.5 * old.skin) ** 2
+        exceeded = jnp.maximum(distance2, jnp.max(progress.max_distance2)) > (0.5 * old.skin) ** 2
         fault = status.flag(status.SKIN_EXCEEDED, exceeded)
-        fault |= status.flag(status.STALLED, work.num_rounds >= MAX_ROUNDS)
+        fault |= status.flag(status.STALLED, progress.num_rounds >= MAX_ROUNDS)
         invalid = self.invalid_block(new, candidates.needed)
         fault = jnp.where(invalid > 0, invalid, fault)
         accepted = (fault == status.OK) & ~too_fast
@@ -297,7 +297,11 @@ class HardDynamics(AbstractSphereDynamics):
         return ImpactCandidates(found.members, rows, found.members // size, needed)
 
     def _state_after_window(
-        self, state: SphereState, candidates: ImpactCandidates, work: ImpactWork, duration: Array
+        self,
+        state: SphereState,
+        candidates: ImpactCandidates,
+        progress: WindowProgress,
+        duration: Array,
     ) -> SphereState:
         """Return the state after a window at its old time, with the length of the next window."""
 
@@ -307,20 +311,21 @@ class HardDynamics(AbstractSphereDynamics):
         def to_members(values, new):
             return values.at[candidates.members].set(new, mode="drop")
 
-        impacts = by_replica(work.impacts) // 2
-        lost = by_replica(work.dissipated)
+        impacts = by_replica(progress.num_impacts) // 2
+        lost = by_replica(progress.dissipated)
         wanted = max(0.5 * self.share * len(state.position), MIN_IMPACTS)
-        num_impacts = jnp.sum(impacts).astype(lost.dtype)
-        if work.wall_impacts is not None:  # each of one sphere, not of two
-            num_impacts = num_impacts + jnp.sum(work.wall_impacts).astype(lost.dtype) / 2
-        ratio = jnp.clip((wanted / jnp.maximum(num_impacts, 1)) ** WINDOW_EXPONENT, 0.5, 1.5)
-        paths = work.paths
+        num_in_window = jnp.sum(impacts).astype(lost.dtype)
+        if progress.num_wall_impacts is not None:  # each of one sphere, not of two
+            num_on_walls = jnp.sum(progress.num_wall_impacts).astype(lost.dtype)
+            num_in_window = num_in_window + num_on_walls / 2
+        ratio = jnp.clip((wanted / jnp.maximum(num_in_window, 1)) ** WINDOW_EXPONENT, 0.5, 1.5)
+        paths = progress.paths
         internal = state.internal
-        more = by_replica(work.regularised).astype(internal.regularised.dtype) // 2
+        more = by_replica(progress.regularised).astype(internal.regularised.dtype) // 2
         regularised = internal.regularised + more
         rotational_gain = None
-        if work.rotational_gain is not None:
-            rotational_gain = internal.rotational_gain + by_replica(work.rotational_gain)
+        if progress.rotational_gain is not None:
+            rotational_gain = internal.rotational_gain + by_replica(progress.rotational_gain)
         # The last, short window before an end says nothing about the rate of impacts.
         full_length = duration > 0.5 * internal.window
         new = state._replace(
@@ -340,7 +345,9 @@ class HardDynamics(AbstractSphereDynamics):
         )
         if state.tangents is None:
             return new
-        return new._replace(tangents=self._tangents_after(state, new, candidates, work, duration))
+        return new._replace(
+            tangents=self._tangents_after(state, new, candidates, progress, duration)
+        )
 
     def recover(self, now: Segment, before: SphereState) -> SphereState:
         """Shorten the window if the skin was exceeded at once, and the skin of a crowded list."""
@@ -393,7 +400,7 @@ class HardDynamics(AbstractSphereDynamics):
         old: SphereState,
         new: SphereState,
         candidates: ImpactCandidates,
-        work: ImpactWork,
+        progress: WindowProgress,
         duration: Array,
     ) -> ExchangeTangents:
         """Return the tangents after a window, from the states before and after it."""
@@ -401,20 +408,20 @@ class HardDynamics(AbstractSphereDynamics):
         scene = self.scene
         replicas = self.replicas
         material = scene.material
-        lost = _sum_by_replica(work.dissipated, candidates, replicas)
-        impacts = _sum_by_replica(work.impacts, candidates, replicas)
+        lost = _sum_by_replica(progress.dissipated, candidates, replicas)
+        impacts = _sum_by_replica(progress.num_impacts, candidates, replicas)
         replica = candidates.replica
         of_gains = replica[candidates.rows.a]
         if scene.container is not None:
             of_gains = jnp.concatenate([of_gains, replica])
-        gains = jnp.zeros((*work.gains.shape[:-1], replicas), lost.dtype)
-        gains = gains.at[..., of_gains].add(work.gains, mode="drop")
+        gains = jnp.zeros((*progress.gains.shape[:-1], replicas), lost.dtype)
+        gains = gains.at[..., of_gains].add(progress.gains, mode="drop")
         before = [kinetic_energy(old.velocity, replicas)]
         gained = [-lost]
-        if work.rotational_gain is not None:
+        if progress.rotational_gain is not None:
             spins = jnp.sum(old.internal.spin.reshape(replicas, -1) ** 2, axis=1)
             before.append(material.surface.inertia / 2 * spins)
-            gained.append(_sum_by_replica(work.rotational_gain, candidates, replicas))
+            gained.append(_sum_by_replica(progress.rotational_gain, candidates, replicas))
         num_energies = len(gained)
         by_direction = gains[:-num_energies]
         by_scale = gains[-num_energies:]
@@ -478,9 +485,7 @@ def hard_records(state: SphereState, scene: SphereScene, replicas: int) -> Recor
         lambda x: x * scene.collision_frequency, tangents.directions.drag
     )
     time = state.time + state.time_rest
-    rates, slopes = exchange_slopes(
-        values, tangents, scene.drag_rates, drag_directions, time, (n, d)
-    )
+    rates, slopes = exchange_slopes(values, tangents, scene.drag_rates, drag_directions, time, n, d)
     if not material.has_elements:
         rates, slopes = (with_dissipated_energy(x, d) for x in (rates, slopes))
     return Records(values, rates, slopes)
