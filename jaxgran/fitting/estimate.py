@@ -35,7 +35,7 @@ from jaxgran.fitting.rows import SCATTER, WHITE, CurveRows, has_no_measured_erro
 from jaxgran.fitting.search import Minimum, deepest, minima_from_starts, minimise
 from jaxgran.fitting.setup import Request, build_problem, problem_with_rate_errors
 from jaxgran.models.base import Limitation
-from jaxgran.models.checks import describe_walls
+from jaxgran.models.limitations import describe_walls
 from jaxgran.models.scales import scales_at
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.parameters import symbol_of

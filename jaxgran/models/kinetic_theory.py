@@ -24,6 +24,7 @@ from jaxgran.data.run_options import DEFAULTS, Run
 from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel, Limitation
 from jaxgran.models.error_model import ErrorModel
+from jaxgran.models.limitations import limitations_of_homogeneity, limitations_of_instant_impacts
 from jaxgran.models.scales import first_cooling_rate
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced import reduced_scene
@@ -339,8 +340,8 @@ class KineticTheory(AbstractModel):
     def limitations(self, gas: Gas, num_particles: int | None = None) -> tuple[Limitation, ...]:
         """Return limitations by contacts that last, correlated collisions, and a growing flow."""
         consequence = "beyond the first-order softness correction"
-        contacts = checks.limitations_of_instant_impacts(gas, consequence)
-        return contacts + checks.limitations_of_homogeneity(gas, num_particles)
+        contacts = limitations_of_instant_impacts(gas, consequence)
+        return contacts + limitations_of_homogeneity(gas, num_particles)
 
     def simplified_for(self, *gases: Gas, displacement: bool = False) -> "KineticTheory":
         """Return this model without D, and with Gaussian spins if all spheres are smooth.

@@ -9,17 +9,17 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from equinox import AbstractClassVar, AbstractVar
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxgran._utils import status
-from jaxgran._utils.tracing import any_traced, nan_where
+from jaxgran._utils.tracing import any_traced, is_known, nan_where
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.particles import Particles
 from jaxgran.data.quantities import QUANTITIES
 from jaxgran.data.run_options import DEFAULTS, Run
 from jaxgran.gradients.rule import Result
-from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.members import by_member, together
 from jaxgran.particles.dynamics import AbstractDynamics
@@ -161,7 +161,7 @@ class AbstractParticleModel(AbstractModel):
         """Return a mask of the times that the run cannot reach, and the status for them."""
         late = jnp.zeros(times.shape, bool)
         if self.transforms_time:
-            late = checks.unreachable_with_drag(gas, times)
+            late = _unreachable_with_drag(gas, times)
         # Traced values could not be checked before the run.
         other_box = has_other_box(self.start, gas, self.num_particles)
         fault = status.flag(status.OUT_OF_RANGE, jnp.any(late))
@@ -188,7 +188,7 @@ class AbstractParticleModel(AbstractModel):
         """
         save = resolve_save(run.save)
         if any_traced(scene, times, start, constants):
-            checks.refuse_files(self, run)
+            _refuse_files(self, run)
             traced = partial(self._run_traced, dimension, save)
             if save is None and start is None and directions is None and self.projected:
                 traced = together(traced, partial(self._run_members, dimension))
@@ -281,6 +281,35 @@ class AbstractParticleModel(AbstractModel):
             return curve.with_saved(jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), saved))
         box_side = jnp.broadcast_to(units.box_side, (len(times), *units.box_side.shape))
         return dataclasses.replace(curve, saved=saved._replace(box_side=box_side))
+
+
+def _unreachable_with_drag(gas: Gas, times: Float[Array, "times"]) -> Bool[Array, "times"]:
+    """Return a mask of the times that particle models with drag cannot reach.
+
+    Raises:
+        ValueError: if gas and times are known, and some times are too late.
+    """
+    if gas.drag is None:
+        return jnp.zeros(times.shape, bool)
+    limit = float(-0.5 * np.log(np.finfo(times.dtype).eps))  # beyond it 1 - gamma s is 0
+    too_late = gas.drag.rate * times > limit
+    if is_known(too_late) and np.any(np.asarray(too_late)):
+        raise ValueError(
+            f"drag has slowed the gas by exp(-{float(gas.drag.rate * times[-1]):.3g}) at the last "
+            f"time; particle models are exact up to exp(-{limit:.3g}). "
+            f"End before t = {limit / float(gas.drag.rate):.4g} s, or use KineticTheory()."
+        )
+    return too_late
+
+
+def _refuse_files(model: AbstractModel, run: Run) -> None:
+    """Raise ValueError if a compiled run should write files."""
+    for name in ("checkpoint", "trajectory"):
+        if (path := getattr(run, name)) is not None:
+            raise ValueError(
+                f"inside jax.jit and jax.vmap {type(model).__name__} cannot write a {name}, got "
+                f"{str(path)!r}. Set {name}=None."
+            )
 
 
 def _start_of_members(
