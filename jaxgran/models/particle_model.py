@@ -21,10 +21,10 @@ from jaxgran.data.quantities import QUANTITIES
 from jaxgran.data.run_options import DEFAULTS, Run
 from jaxgran.gradients.rule import Result
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.members import by_member, together
+from jaxgran.models.members import split_members, start_members, with_batch_rule
 from jaxgran.particles.dynamics import AbstractDynamics
 from jaxgran.particles.elements import flight_time
-from jaxgran.particles.run import Recorder, grouped, run_on_host, run_traced, start_traced
+from jaxgran.particles.run import Recorder, grouped, run_on_host, run_traced
 from jaxgran.particles.snapshot import Units, resolve_save
 from jaxgran.particles.start import has_other_box, reduced_start
 from jaxgran.scene.gas import Gas
@@ -191,7 +191,7 @@ class AbstractParticleModel(AbstractModel):
             _refuse_files(self, run)
             traced = partial(self._run_traced, dimension, save)
             if save is None and start is None and directions is None and self.projected:
-                traced = together(traced, partial(self._run_members, dimension))
+                traced = with_batch_rule(traced, partial(self._run_members, dimension))
             return traced(scene, TracedInputs(times, start, constants, directions))
         groups = grouped(self.replicas, self.num_particles if self.has_positions else 0)
         dynamics = self.dynamics(scene, dimension, self.replicas // groups.number)
@@ -236,11 +236,11 @@ class AbstractParticleModel(AbstractModel):
         alone = self.dynamics(first, dimension, self.replicas, traced=True)
         key = inputs.constants.key
         key_differs = bool(inputs_differ.constants.key)
-        start, fault = _start_of_members(alone, key, key_differs, members)
+        start, fault = start_members(alone, key, key_differs, members)
         recorder = Recorder(dynamics, inputs.constants.units, None)
         first_key = key[0] if key_differs else key
         result = run_traced(recorder, inputs.times, start, first_key, None, fault)
-        return by_member(result, members)
+        return split_members(result, members)
 
     @eqx.filter_jit
     def _curve(
@@ -305,23 +305,9 @@ def _unreachable_with_drag(gas: Gas, times: Float[Array, "times"]) -> Bool[Array
 def _refuse_files(model: AbstractModel, run: Run) -> None:
     """Raise ValueError if a compiled run should write files."""
     for name in ("checkpoint", "trajectory"):
-        if (path := getattr(run, name)) is not None:
+        path = getattr(run, name)
+        if path is not None:
             raise ValueError(
                 f"inside jax.jit and jax.vmap {type(model).__name__} cannot write a {name}, got "
                 f"{str(path)!r}. Set {name}=None."
             )
-
-
-def _start_of_members(
-    alone: AbstractDynamics, key: Array, key_differs: bool, members: int
-) -> tuple[Any, Int[Array, ""]]:
-    """Return the random starts of members of a batch in one array, and their faults.
-
-    The members have a common start, as one of them would have alone, or one for each key.
-    """
-    if not key_differs:
-        start, fault = start_traced(alone, key)
-        return jax.tree.map(lambda x: jnp.tile(x, (members, 1)), start), fault
-    starts, faults = jax.vmap(partial(start_traced, alone))(key)
-    start = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), starts)
-    return start, jnp.bitwise_or.reduce(faults)

@@ -305,14 +305,15 @@ class AbstractSpheres(AbstractParticleModel):
         law = self.laws_of_replicas(laws, differs.material.law)
         if law is None:
             return None
-        together = scene._replace(
+        merged_scene = scene._replace(
             contact_duration=jnp.min(scene.contact_duration),
             material=scene.material._replace(law=law),
         )
         multiple = math.ceil(members / SIZED_MEMBERS)
-        longer = sizes._replace(capacity=sizes.capacity.of_members(multiple))
+        longer = sizes._replace(capacity=sizes.capacity.of_batch(multiple))
         engine = choose_engine(self.neighbours, sizes.engine, traced=True)
-        return self.motion(together, (replicas, self.num_particles, dimension), longer, engine)
+        shape = replicas, self.num_particles, dimension
+        return self.motion(merged_scene, shape, longer, engine)
 
 
 def _check_packing(gas: Gas, num_particles: int, random: bool) -> None:
