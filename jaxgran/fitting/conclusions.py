@@ -27,7 +27,7 @@ from jaxgran.fitting.result import (
 )
 from jaxgran.fitting.setup import Request
 from jaxgran.models.base import AbstractModel, Limitation
-from jaxgran.models.checks import describe_walls
+from jaxgran.models.limitations import describe_walls
 from jaxgran.scene.parameters import symbol_of, unit_of
 
 RISING_SIGNIFICANCE = 0.05

@@ -22,7 +22,7 @@ from jaxgran.fitting.rows import (
 )
 from jaxgran.fitting.time_grid import time_grid
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.choose import error_model_of_curve
+from jaxgran.models.error_model import ErrorModel
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.linearise import curve_of_program, with_neutral_elements
 from jaxgran.models.scales import scales_at
@@ -96,7 +96,7 @@ def with_rate_error(rows: CurveRows, model: AbstractModel, gas: Gas) -> CurveRow
     curve = curve_of_program(exact, gas, times, rows.displacement is not None)
     if not np.all(np.isfinite(np.asarray(curve.temperature))):
         return rows
-    error_model = error_model_of_curve(gas, curve, rows.measurement.num_particles)
+    error_model = ErrorModel.from_curve(gas, curve, rows.measurement.num_particles)
     error = np.broadcast_to(model.rate_error(error_model), times.shape)
     return replace(rows, rate_error=RateError(times, np.asarray(error, float)))
 

@@ -15,7 +15,7 @@ from jaxgran.fitting.parameters import with_parameters
 from jaxgran.fitting.priors import SMOOTHNESS, extra_parameters, prior_residuals
 from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.simulations import Search, Simulations, information_by
-from jaxgran.models.choose import error_model_of_curve
+from jaxgran.models.error_model import ErrorModel
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.linearise import linearise, with_neutral_elements
 from jaxgran.scene.gas import Gas
@@ -142,7 +142,7 @@ def derivative_bias(sims: Simulations, search: Search, gas: Gas, sensitivity: np
     bias = curve.derivative_bias
     if bias is None:
         N = getattr(sims.model, "num_particles", None)
-        error_model = error_model_of_curve(gas, _from_start(gas, curve), N)
+        error_model = ErrorModel.from_curve(gas, _from_start(gas, curve), N)
         whole = np.broadcast_to(sims.model.derivative_error(error_model), error_model.time.shape)
         bias = whole[-curve.times.size :]
     weights = np.sum(sensitivity[: curve.times.size] ** 2, axis=1)

@@ -6,7 +6,7 @@
   `particle_model` is the base of the last three, and `spheres` of the last two.
 - `linearise`: the program that fits, diagnoses and the choice of a model share.
 - `choose`: choice of a model, by the errors that `error_model` estimates.
-- `checks`: checks of arguments and scenes.
+- `checks`: checks of arguments and scenes; `limitations`: limits of validity of the models.
 
 No module outside this package knows a model by its class, except for the default.
 

@@ -12,19 +12,14 @@ from jaxtyping import ArrayLike
 from jaxgran._utils import status
 from jaxgran._utils.formatting import text_table
 from jaxgran._utils.tracing import any_traced
-from jaxgran._utils.validation import POSITIVE, checked_float, checked_times
-from jaxgran.data.curve import CoolingCurve
+from jaxgran._utils.validation import POSITIVE, checked_float, checked_int, checked_times
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.checks import (
-    check_softness_at,
-    check_volume,
-    checked_gas,
-    describe_walls,
-)
+from jaxgran.models.checks import check_softness_at, check_volume, checked_gas
 from jaxgran.models.dsmc import DSMC
-from jaxgran.models.error_model import ErrorModel, flow_share
+from jaxgran.models.error_model import ErrorModel
 from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.models.limitations import describe_walls
 from jaxgran.models.linearise import curve_of_program
 from jaxgran.models.particle_model import AbstractParticleModel
 from jaxgran.models.scales import scales_at
@@ -36,34 +31,6 @@ NUM_PARTICLES = 4000
 
 NUM_TIMES = 64
 """Number of times at which an `ErrorModel` samples the cooling gas."""
-
-REASONS = {
-    # the first one
-    "chosen": "{name}: the fastest model whose estimated error of T, {error}, is within "
-    "{tolerance}.",
-    "no model": "{name}: the most accurate model, with an estimated error of T of {error}; no "
-    "model is within {tolerance}.",
-    "more particles": " More particles or replicas reduce the noise.",
-    # the scene
-    "falls": "T falls to {lowest:.2g} T_0 in {collisions:.3g} collisions per particle.",
-    "rises": "T rises to {end:.2g} T_0 in {collisions:.3g} collisions per particle.",
-    "contacts": "Contacts last {duration} of the mean free time and overlap by {overlap} of a "
-    "diameter: the error of T is {hard} with instantaneous impacts, {corrected} with kinetic "
-    "theory's first-order correction.",
-    "unknown box": "At a packing fraction of {phi:.2g} the error of kinetic theory is {error} if "
-    "the gas stays homogeneous; without num_particles the box is unknown, and clustering is not "
-    "estimated.",
-    "box": "At a packing fraction of {phi:.2g} in a box of {ratio:.2g} L_c, where the flow reaches "
-    "{flow} of the energy, the error of homogeneous models is {error}.{clusters} The box {walls}.",
-    "clusters": " Clusters follow the flow (see Gas.critical_box).",
-    "noise": "{number} particles have a noise of {noise} in T.",
-    "noise and flow": "{number} particles have a noise of {noise} in T, {both} with the random "
-    "amplitudes of the flow.",
-    "friction": "These estimates leave friction out.",
-    # models that do not support the scene
-    "refused": "{name}: {refusal}.",
-}
-"""Reasons and their parts by name, with places for values."""
 
 
 class Candidate(NamedTuple):
@@ -159,13 +126,14 @@ def choose_model(
         )
     tolerance = checked_float("tolerance", tolerance, POSITIVE, "0.02 allows T to err by 2 %.")
     if num_particles is not None:
+        num_particles = checked_int("num_particles", num_particles, 1)
         check_volume(gas, num_particles)
     size = NUM_PARTICLES if num_particles is None else num_particles
     models = default_models(size, replicas) if models is None else models
     if not models:
         raise ValueError("models must be a sequence of models, or None for all; got none")
     end = float(checked_times(times)[-1])
-    error_model = error_model_of(gas, end, num_particles)
+    error_model = predict_error_model(gas, end, num_particles)
     candidates = tuple(_candidate(model, error_model) for model in models)
     possible = [(c.error, c) for c in candidates if c.error is not None]
     if not possible:
@@ -175,9 +143,19 @@ def choose_model(
     error, best = good[0] if good else min(possible, key=lambda pair: pair[0])
     reasons = [
         _verdict(best.model, error, tolerance, enough=bool(good)),
-        *_describe_scene(error_model, best.model, *models),
-        *(_refused(c.model, c.refusal) for c in candidates if c.refusal),
+        _describe_cooling(error_model),
+        _describe_contacts(error_model),
+        _describe_box(error_model),
     ]
+    of_particles = (x for x in (best.model, *models) if isinstance(x, AbstractParticleModel))
+    noisy = next(of_particles, None)
+    if noisy is not None:
+        reasons.append(_describe_noise(error_model, noisy))
+    if "friction" in gas.elements:
+        reasons.append("These estimates leave friction out.")
+    for c in candidates:
+        if c.refusal is not None:
+            reasons.append(f"{_capitalised(c.model.name)}: {c.refusal.rstrip('.')}.")
     return Choice(best.model, tuple(reasons), candidates, error)
 
 
@@ -190,109 +168,82 @@ def _candidate(model: AbstractModel, error_model: ErrorModel) -> Candidate:
 
 
 def _verdict(model: AbstractModel, error: float, tolerance: float, enough: bool) -> str:
-    verdict = REASONS["chosen" if enough else "no model"].format(
-        name=_capitalised(model.name), error=_percent(error), tolerance=_percent(tolerance)
+    name = _capitalised(model.name)
+    if enough:
+        return (
+            f"{name}: the fastest model whose estimated error of T, {_percent(error)}, is within "
+            f"{_percent(tolerance)}."
+        )
+    verdict = (
+        f"{name}: the most accurate model, with an estimated error of T of {_percent(error)}; no "
+        f"model is within {_percent(tolerance)}."
     )
-    if model.stochastic and not enough:
-        verdict += REASONS["more particles"]
+    if model.stochastic:
+        verdict += " More particles or replicas reduce the noise."
     return verdict
 
 
-def _refused(model: AbstractModel, refusal: str) -> str:
-    return REASONS["refused"].format(name=_capitalised(model.name), refusal=refusal.rstrip("."))
+def predict_error_model(gas: Gas, end: float, num_particles: int | None = None) -> ErrorModel:
+    """Return the error model of a gas from t = 0 to an end, by kinetic theory without friction.
 
-
-def error_model_of(gas: Gas, end: float, num_particles: int | None = None) -> ErrorModel:
-    """Return the error model of a gas from t = 0 to `end`, s, by kinetic theory without friction.
+    Args:
+        gas: the scene.
+        end: last time, s.
+        num_particles: N of the gas; None if unknown.
 
     Raises:
         ValueError: for a gas so soft that the softness correction is invalid.
         RuntimeError: if kinetic theory cannot reach the end.
     """
-    scales = scales_at(gas)
-    check_softness_at(gas, 1.0, float(scales.softness))
-    mean_free_time = float(scales.mean_free_time)
+    check_softness_at(gas, 1.0)
+    mean_free_time = float(scales_at(gas).mean_free_time)
     grid = np.linspace(0, np.log1p(end / mean_free_time), NUM_TIMES)
     known = dataclasses.replace(gas, surface=None) if "friction" in gas.elements else gas
     curve = curve_of_program(KineticTheory(), known, np.expm1(grid) * mean_free_time)
     fault = int(jnp.asarray(curve.status))
     if fault != status.OK:
         raise RuntimeError(f"kinetic theory, which estimates the errors: {status.explain(fault)}")
-    error_model = error_model_of_curve(gas, curve, num_particles)
-    softest = int(np.argmax(error_model.softness))
-    hottest = np.exp(error_model.log_temperature[softest] / 2)
-    check_softness_at(gas, hottest, float(error_model.softness[softest]))
+    error_model = ErrorModel.from_curve(gas, curve, num_particles)
+    softest = np.argmax(error_model.softness)
+    check_softness_at(gas, float(np.exp(error_model.log_temperature[softest])))
     return error_model
 
 
-def error_model_of_curve(
-    gas: Gas, curve: CoolingCurve, num_particles: int | None = None
-) -> ErrorModel:
-    """Return the error model of a gas from its cooling curve, which begins at t = 0.
-
-    a_2 and the collisions are set to 0 if the curve does not have them.
-    """
-    temperature = np.asarray(curve.temperature)
-    zero = np.zeros_like(temperature)
-    values = {
-        "time": curve.times,
-        "log_temperature": np.log(temperature / np.asarray(gas.temperature)),
-        "collisions": zero if curve.collisions is None else curve.collisions,
-        "sonine": zero if curve.sonine is None else curve.sonine,
-    }
-    scales = scales_at(gas, temperature)
-    for name in ("contact_fraction", "overlap", "softness"):
-        values[name] = getattr(scales, name)
-    values = {name: np.asarray(value, float) for name, value in values.items()}
-    flow = np.zeros_like(values["time"])
-    scatter = flow
-    if num_particles is not None:
-        critical = np.asarray(scales.critical_box, float)
-        flow, scatter = flow_share(gas, values["log_temperature"], critical, num_particles)
-    return ErrorModel(gas, num_particles, **values, flow_share=flow, flow_scatter=scatter)
-
-
-def _describe_scene(error_model: ErrorModel, *models: AbstractModel) -> list[str]:
-    """Return clauses on a scene, and on the noise of the first model of particles."""
-    hard = error_model.error_of_temperature(error_model.instant_contacts)
-    corrected = error_model.error_of_temperature(error_model.corrected_contacts)
+def _describe_cooling(error_model: ErrorModel) -> str:
     lowest, end = np.exp([error_model.log_temperature.min(), error_model.log_temperature[-1]])
     heated = error_model.gas.drive is not None and end > 1
-    reasons = [
-        REASONS["rises" if heated else "falls"].format(
-            lowest=lowest, end=end, collisions=error_model.collisions[-1]
-        ),
-        REASONS["contacts"].format(
-            duration=_percent(error_model.contact_fraction.max()),
-            overlap=_percent(error_model.overlap.max()),
-            hard=_percent(hard),
-            corrected=_percent(corrected),
-        ),
-        _describe_box(error_model),
-    ]
-    of_particles = [x for x in models if isinstance(x, AbstractParticleModel)]
-    reasons += [_describe_noise(error_model, x) for x in of_particles[:1]]
-    if "friction" in error_model.gas.elements:
-        reasons.append(REASONS["friction"])
-    return reasons
+    change = f"rises to {end:.2g}" if heated else f"falls to {lowest:.2g}"
+    return f"T {change} T_0 in {error_model.collisions[-1]:.3g} collisions per particle."
+
+
+def _describe_contacts(error_model: ErrorModel) -> str:
+    instant = error_model.error_of_temperature(error_model.instant_contacts)
+    corrected = error_model.error_of_temperature(error_model.corrected_contacts)
+    return (
+        f"Contacts last {_percent(error_model.contact_fraction.max())} of the mean free time and "
+        f"overlap by {_percent(error_model.overlap.max())} of a diameter: the error of T is "
+        f"{_percent(instant)} with instantaneous impacts, {_percent(corrected)} with kinetic "
+        "theory's first-order correction."
+    )
 
 
 def _describe_box(error_model: ErrorModel) -> str:
     gas = error_model.gas
-    phi = float(gas.packing_fraction)
     error = _percent(error_model.error_of_temperature(error_model.correlated))
+    density = f"At a packing fraction of {float(gas.packing_fraction):.2g}"
     if error_model.num_particles is None:
-        return REASONS["unknown box"].format(phi=phi, error=error)
+        return (
+            f"{density} the error of kinetic theory is {error} if the gas stays homogeneous; "
+            "without num_particles the box is unknown, and clustering is not estimated."
+        )
     scales = scales_at(gas)
     side = scales.box_side(error_model.num_particles, gas.dimension)
     ratio = side / float(scales.critical_box)
-    return REASONS["box"].format(
-        phi=phi,
-        ratio=ratio,
-        flow=_percent(error_model.flow_share.max()),
-        error=error,
-        clusters=REASONS["clusters"] if ratio > 1 else "",
-        walls=describe_walls(gas, error_model.num_particles),
+    clusters = " Clusters follow the flow (see Gas.critical_box)." if ratio > 1 else ""
+    return (
+        f"{density} in a box of {ratio:.2g} L_c, where the flow reaches "
+        f"{_percent(error_model.flow_share.max())} of the energy, the error of homogeneous models "
+        f"is {error}.{clusters} The box {describe_walls(gas, error_model.num_particles)}."
     )
 
 
@@ -300,9 +251,11 @@ def _describe_noise(error_model: ErrorModel, model: AbstractParticleModel) -> st
     number = model.num_particles * model.replicas
     noise = error_model.shot_noise(number)
     flowing = error_model.flow_noise(model.replicas)
-    return REASONS["noise" if flowing <= noise / 10 else "noise and flow"].format(
-        number=number, noise=_percent(noise), both=_percent(hypot(noise, flowing))
-    )
+    sentence = f"{number} particles have a noise of {_percent(noise)} in T"
+    if flowing > noise / 10:
+        both = _percent(hypot(noise, flowing))
+        sentence += f", {both} with the random amplitudes of the flow"
+    return f"{sentence}."
 
 
 def _capitalised(text: str) -> str:

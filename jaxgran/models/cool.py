@@ -1,17 +1,21 @@
 """`cool`: the cooling curve of a gas by any model."""
 
+import dataclasses
 import os
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import ArrayLike, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray
 
 from jaxgran._utils import status
-from jaxgran._utils.tracing import is_known
+from jaxgran._utils.tracing import any_traced, is_known, known_part, nan_where
 from jaxgran._utils.validation import check_bool, checked_times
 from jaxgran.data.checkpoint import saved_at_termination
 from jaxgran.data.curve import CoolingCurve
@@ -22,7 +26,8 @@ from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.choose import choose_model
 from jaxgran.models.kinetic_theory import KineticTheory
-from jaxgran.scene.gas import Gas
+from jaxgran.scene.gas import Gas, is_allowed_spread
+from jaxgran.scene.geometry import MIN_BOX
 
 
 def cool(
@@ -117,14 +122,14 @@ def cool(
     if checkpoint is not None:
         check_writable(os.fspath(checkpoint))
     model.check_scene(gas)
-    gas, simulated, allowed = checks.valid_where_traced(gas, times)
+    gas, simulated, allowed = _valid_where_traced(gas, times)
     run = Run(key, progress, checkpoint, save, trajectory)
     if allowed is not None and is_known(allowed) and not allowed:
-        curve = checks.unknown_curve(model, gas, simulated, run)
+        curve = _unknown_curve(model, gas, simulated, run)
     else:
         with saved_at_termination(checkpoint):
             curve = model.simulate(gas, simulated, run)
-    curve = checks.nan_unless(allowed, curve, times)
+    curve = _nan_unless(allowed, curve, times)
     if throw and curve.status is not None and not isinstance(curve.status, Tracer):
         _raise_if_failed(curve, gas)
     return curve
@@ -138,6 +143,85 @@ def _check_path(name: str, path: Any, model: AbstractModel, supported: bool, lac
             f"{type(model).__name__} has {lack}, got {name}={str(path)!r}. Use HardSpheres or "
             f"SoftSpheres, or set {name}=None."
         )
+
+
+def _valid_where_traced(
+    gas: Gas, times: Float[Array, "times"]
+) -> tuple[Gas, Float[Array, "times"], Bool[Array, ""] | None]:
+    """Replace a gas and times whose traced values are out of range by ones that models accept.
+
+    Returns:
+        The gas, nan where a traced parameter is out of range; the times, replaced if traced ones do
+        not increase from 0 or later; and True if all values were allowed, None if nothing is
+        traced.
+    """
+    if not any_traced(gas, times):
+        return gas, times, None
+    # Also values that are known and only carry a tangent, which `Gas` does not check.
+    traced = {name: gas.value(name) for name in gas.domains}
+    traced = {name: value for name, value in traced.items() if any_traced(value)}
+    allowed = jnp.ones((), bool)
+    for name, value in traced.items():
+        allowed &= jnp.all(gas.domains[name].contains(value))
+    if gas.container is not None:
+        allowed &= jnp.all(gas.container.side / gas.diameter > MIN_BOX)
+    if gas.diameter_sd is not None:
+        allowed &= is_allowed_spread(gas.size_spread)
+    one_or_nan = jnp.where(allowed, 1.0, jnp.nan)
+    # A product, so that derivatives are nan, too: an optimiser would take 0 for a minimum.
+    gas = gas.replace(**{name: x * one_or_nan.astype(x.dtype) for name, x in traced.items()})
+    if any_traced(times):
+        increase = jnp.all(jnp.diff(times) > 0) & (times[0] >= 0) & jnp.isfinite(times[-1])
+        allowed &= increase
+        times = jnp.where(increase, times, jnp.arange(1.0, 1.0 + times.size, dtype=times.dtype))
+    return gas, times, allowed
+
+
+def _allowed_gas(gas: Gas) -> Gas:
+    """Return a gas of known numbers, with those out of range replaced by ones in the range."""
+    gas = jax.tree.map(known_part, gas)
+    wrong = {}
+    for name, domain in gas.domains.items():
+        value = gas.value(name)
+        if not np.all(domain.contains(value)):
+            inside = domain.low if domain.low_allowed else domain.from_free(0.0)
+            wrong[name] = jnp.full_like(value, inside)
+    return gas.replace(**wrong)
+
+
+def _unknown_curve(
+    model: AbstractModel, gas: Gas, times: Float[Array, "times"], run: Run
+) -> CoolingCurve:
+    """Return a curve of the shapes of a run, which is nan, in the values and derivatives of a gas.
+
+    It stands for a run with numbers that are known, and not allowed.
+    """
+    options = Run(run.key, save=run.save)
+    model = model.sized_for(_allowed_gas(gas))
+    shapes = eqx.filter_eval_shape(
+        lambda gas, times: model.simulate(gas, times, options), gas, times
+    )
+    traced = (gas.value(name) for name in gas.domains)
+    total = sum((jnp.sum(x) for x in traced if any_traced(x)), start=jnp.zeros(())) * jnp.nan
+
+    def filled(shape: jax.ShapeDtypeStruct) -> Array:
+        zeros = jnp.zeros(shape.shape, shape.dtype)
+        return zeros + total.astype(shape.dtype) if eqx.is_inexact_array(zeros) else zeros
+
+    return jax.tree.map(filled, shapes)
+
+
+def _nan_unless(
+    allowed: Bool[Array, ""] | None, curve: CoolingCurve, times: Float[Array, "times"]
+) -> CoolingCurve:
+    """Return the curve, with all floats nan and a status if a value was not allowed."""
+    if allowed is None:
+        return curve
+    masked = jax.tree.map(lambda x: nan_where(~allowed, x), curve)
+    fault = status.flag(status.OUT_OF_RANGE, ~allowed)
+    if curve.status is not None:
+        fault = jnp.where(allowed, curve.status, fault)
+    return dataclasses.replace(masked, times=times, status=fault)
 
 
 def _raise_if_failed(curve: CoolingCurve, gas: Gas) -> None:

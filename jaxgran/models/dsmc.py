@@ -13,6 +13,7 @@ from jaxgran.gradients.rule import Result, differentiable
 from jaxgran.models import checks
 from jaxgran.models.base import Limitation
 from jaxgran.models.error_model import ErrorModel
+from jaxgran.models.limitations import limitations_of_homogeneity, limitations_of_instant_impacts
 from jaxgran.models.particle_model import AbstractParticleModel
 from jaxgran.particles.dsmc.collisions import Scheme
 from jaxgran.particles.dsmc.dynamics import DSMCDynamics
@@ -108,8 +109,8 @@ class DSMC(AbstractParticleModel):
 
     def limitations(self, gas: Gas, num_particles: int | None = None) -> tuple[Limitation, ...]:
         """Return limitations by contacts that last, correlated collisions, and a growing flow."""
-        contacts = checks.limitations_of_instant_impacts(gas)
-        return contacts + checks.limitations_of_homogeneity(gas, num_particles)
+        contacts = limitations_of_instant_impacts(gas)
+        return contacts + limitations_of_homogeneity(gas, num_particles)
 
     def scene(self, gas: Gas) -> ReducedScene:
         """Return the gas in units of its path length and impact speed."""

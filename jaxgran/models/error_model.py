@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxgran.data.curve import CoolingCurve
 from jaxgran.models.scales import scales_at
 from jaxgran.scene.gas import Gas
 
@@ -161,8 +162,8 @@ class ErrorModel(NamedTuple):
         flow_share: mean share of the kinetic energy in the flow, 0 where the box is unknown.
         flow_scatter: standard deviation of this share between realisations.
 
-    >>> from jaxgran.models.choose import error_model_of
-    >>> error_model = error_model_of(gas, end=3.0)
+    >>> from jaxgran.models.choose import predict_error_model
+    >>> error_model = predict_error_model(gas, end=3.0)
     >>> 0.005 < error_model.error_of_temperature(0.01) < 0.02
     True
     """
@@ -178,6 +179,41 @@ class ErrorModel(NamedTuple):
     softness: Float[np.ndarray, "times"]
     flow_share: Float[np.ndarray, "times"]
     flow_scatter: Float[np.ndarray, "times"]
+
+    @classmethod
+    def from_curve(
+        cls, gas: Gas, curve: CoolingCurve, num_particles: int | None = None
+    ) -> "ErrorModel":
+        """Return the error model of a gas from its cooling curve, which begins at t = 0.
+
+        a_2 and the collisions are set to 0 if the curve does not have them.
+
+        Args:
+            gas: the scene.
+            curve: T at times from t = 0 on.
+            num_particles: N of the gas; None if unknown.
+        """
+        temperature = np.asarray(curve.temperature)
+        log_temperature = np.log(temperature / np.asarray(gas.temperature)).astype(float)
+        scales = scales_at(gas, temperature)
+        zero = np.zeros(temperature.shape)
+        share, scatter = zero, zero
+        if num_particles is not None:
+            critical_box = np.asarray(scales.critical_box, float)
+            share, scatter = flow_share(gas, log_temperature, critical_box, num_particles)
+        return cls(
+            gas=gas,
+            num_particles=num_particles,
+            time=np.asarray(curve.times, float),
+            log_temperature=log_temperature,
+            collisions=zero if curve.collisions is None else np.asarray(curve.collisions, float),
+            sonine=zero if curve.sonine is None else np.asarray(curve.sonine, float),
+            contact_fraction=np.asarray(scales.contact_fraction, float),
+            overlap=np.asarray(scales.overlap, float),
+            softness=np.asarray(scales.softness, float),
+            flow_share=share,
+            flow_scatter=scatter,
+        )
 
     def error_of_temperature(self, rate_error: Float[np.ndarray, "times"] | float) -> float:
         """Relative error of T, at the worst time, by a relative error e(t) of the cooling rate.
@@ -254,8 +290,8 @@ class ErrorModel(NamedTuple):
         loss = 1 - float(law.restitution(jnp.ones(())))
         near = np.max(np.asarray(gas.diameter / (walls.side - gas.diameter)))
         error = min(ELASTIC_WALL_ERROR + LOSS_WALL_ERROR * loss, WALL_ERROR)
-        hottest = np.minimum(self.log_temperature, 0.0)
-        return error * np.exp(hottest / 2) + NARROW_BOX * float(near) ** 4
+        speed = np.exp(np.minimum(self.log_temperature, 0.0) / 2)  # sqrt(T/T_0), at most 1
+        return error * speed + NARROW_BOX * float(near) ** 4
 
     @property
     def roughness(self) -> float:

@@ -15,6 +15,7 @@ from jaxgran.data.particles import Particles
 from jaxgran.models import checks
 from jaxgran.models.base import Limitation
 from jaxgran.models.error_model import ErrorModel
+from jaxgran.models.limitations import limitations_of_instant_impacts
 from jaxgran.models.spheres import AbstractSpheres, ArraySizes
 from jaxgran.particles.capacity import capacities
 from jaxgran.particles.hard.dynamics import (
@@ -166,7 +167,7 @@ class HardSpheres(AbstractSpheres):
 
     def limitations(self, gas: Gas, num_particles: int | None = None) -> tuple[Limitation, ...]:
         """Return limitations by contacts that last and overlap."""
-        return checks.limitations_of_instant_impacts(gas)
+        return limitations_of_instant_impacts(gas)
 
     def scene(self, gas: Gas) -> SphereScene:
         """Return the gas in units of its diameter, mass and initial temperature."""

@@ -1,62 +1,87 @@
-"""Members of a batch by `jax.vmap` in one array: those that differ in their law alone.
+"""One array for the members of a batch by `jax.vmap`, if they differ only in their law.
 
-A batched loop waits for its slowest member in each of its steps, so that a batch of spheres takes
-as long as its members one after the other. Replicas of one gas share their arrays and blocks or
-windows of time instead. Members that differ in the law of their impacts alone become such replicas,
-each with its own law, which all begin from the start that one of them would have. They are as
-accurate as alone, but for some collisions only the same.
+A batched loop waits for its slowest member in each step, so a batch of spheres takes as long as its
+members one after the other. Replicas of one gas share arrays and blocks or windows of time instead.
+Members that differ only in the law of their impacts run as such replicas, each with its own law.
+They have one start, or one for each key. Each is as accurate as when it runs alone; its numbers
+agree with that run only for the first collisions.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Int
 
 from jaxgran.gradients.rule import Records, Result
+from jaxgran.particles.dynamics import AbstractDynamics
+from jaxgran.particles.run import start_traced
 
 
-def together(
+def with_batch_rule(
     run: Callable[[Any, Any], Result],
-    of_members: Callable[[Any, Any, Any, int], Result | None],
+    run_members: Callable[[Any, Any, Any, int], Result | None],
 ) -> Callable[[Any, Any], Result]:
     """Return the same run with a rule for `jax.vmap`.
 
     Args:
-        run: a function of a scene and of all else.
-        of_members: the same for several members. Its further arguments are a pair like its inputs,
-            with True at what has a first axis of members, and the number of members. It returns
-            None if they cannot share an array.
+        run: a function of a scene and of all other inputs.
+        run_members: the same for several members, as a function of scene and inputs, of a pair of
+            the same structure, True at arrays with a first axis of members, and of the number of
+            members. It returns None if they cannot share an array; then `jax.vmap` batches `run`.
     """
 
     @jax.custom_batching.custom_vmap
-    def one(scene: Any, others: Any) -> Result:
-        return run(scene, others)
+    def run_one(scene: Any, inputs: Any) -> Result:
+        return run(scene, inputs)
 
-    @one.def_vmap
-    def several(members: int, differs: Any, scene: Any, others: Any) -> tuple[Result, Any]:
-        found = of_members(scene, others, tuple(differs), members)
-        if found is None:
+    @run_one.def_vmap
+    def run_batch(members: int, differs: Any, scene: Any, inputs: Any) -> tuple[Result, Any]:
+        result = run_members(scene, inputs, tuple(differs), members)
+        if result is None:
             axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(differs))
-            found = jax.vmap(run, in_axes=axes, axis_size=members)(scene, others)
-        return found, jax.tree.map(lambda _: True, found)
+            result = jax.vmap(run, in_axes=axes, axis_size=members)(scene, inputs)
+        return result, jax.tree.map(lambda _: True, result)
 
-    return one
+    return run_one
 
 
-def by_member(result: Result, members: int) -> Result:
-    """Return the result of replicas with a first axis of members, to each of which some belong."""
+def start_members(
+    alone: AbstractDynamics, key: Array, key_differs: bool, members: int
+) -> tuple[Any, Int[Array, ""]]:
+    """Return the random start of all members in one array, and its faults.
 
-    def of_records(x: Array) -> Array:
+    Args:
+        alone: the motion of one member.
+        key: of the random numbers, with a first axis of members if it differs between them.
+        key_differs: if False, all members have the start that one of them has alone.
+        members: number of members.
+    """
+    if not key_differs:
+        start, fault = start_traced(alone, key)
+        return jax.tree.map(lambda x: jnp.tile(x, (members, 1)), start), fault
+    starts, faults = jax.vmap(partial(start_traced, alone))(key)
+    start = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), starts)
+    return start, jnp.bitwise_or.reduce(faults)
+
+
+def split_members(result: Result, members: int) -> Result:
+    """Return the result of one array with a first axis of members, which all have its status.
+
+    The run had no tangents and saved nothing. Replicas are in the order of the members.
+    """
+
+    def split_records(x: Array) -> Array:
         return jnp.moveaxis(x.reshape(*x.shape[:-1], members, -1), -2, 0)
 
-    def of_particles(x: Array) -> Array:
+    def split_particles(x: Array) -> Array:
         return x.reshape(members, -1, *x.shape[1:])
 
-    values = {name: of_records(x) for name, x in result.records.values.items()}
+    values = {name: split_records(x) for name, x in result.records.values.items()}
     return Result(
-        Records(values, {}, {}),
-        jax.tree.map(of_particles, result.particles),
+        Records(values, rates={}, tangents={}),
+        jax.tree.map(split_particles, result.particles),
         jnp.broadcast_to(result.status, (members,)),
     )

@@ -9,23 +9,23 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from equinox import AbstractClassVar, AbstractVar
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxgran._utils import status
-from jaxgran._utils.tracing import any_traced, nan_where
+from jaxgran._utils.tracing import any_traced, is_known, nan_where
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.particles import Particles
 from jaxgran.data.quantities import QUANTITIES
 from jaxgran.data.run_options import Run
 from jaxgran.gradients.rule import Result
-from jaxgran.models import checks
 from jaxgran.models.base import AbstractModel
-from jaxgran.models.members import by_member, together
+from jaxgran.models.members import split_members, start_members, with_batch_rule
 from jaxgran.particles.dynamics import AbstractDynamics
 from jaxgran.particles.elements import flight_time
 from jaxgran.particles.groups import grouped
-from jaxgran.particles.run import Recorder, run_on_host, run_traced, start_traced
+from jaxgran.particles.run import Recorder, run_on_host, run_traced
 from jaxgran.particles.snapshot import Units, resolve_save
 from jaxgran.particles.start import has_other_box, reduced_start
 from jaxgran.scene.gas import Gas
@@ -162,7 +162,7 @@ class AbstractParticleModel(AbstractModel):
         """Return a mask of the times that the run cannot reach, and the status for them."""
         late = jnp.zeros(times.shape, bool)
         if self.transforms_time:
-            late = checks.unreachable_with_drag(gas, times)
+            late = _unreachable_with_drag(gas, times)
         # Traced values could not be checked before the run.
         other_box = has_other_box(self.start, gas, self.num_particles)
         fault = status.flag(status.OUT_OF_RANGE, jnp.any(late))
@@ -189,10 +189,10 @@ class AbstractParticleModel(AbstractModel):
         """
         save = resolve_save(run.save)
         if any_traced(scene, times, start, constants):
-            checks.refuse_files(self, run)
+            _refuse_files(self, run)
             traced = partial(self._run_traced, dimension, save)
             if save is None and start is None and directions is None and self.projected:
-                traced = together(traced, partial(self._run_members, dimension))
+                traced = with_batch_rule(traced, partial(self._run_members, dimension))
             return traced(scene, TracedInputs(times, start, constants, directions))
         groups = grouped(self.replicas, self.num_particles if self.has_positions else 0)
         dynamics = self.dynamics(scene, dimension, self.replicas // groups.number)
@@ -237,11 +237,11 @@ class AbstractParticleModel(AbstractModel):
         alone = self.dynamics(first, dimension, self.replicas, traced=True)
         key = inputs.constants.key
         key_differs = bool(inputs_differ.constants.key)
-        start, fault = _start_of_members(alone, key, key_differs, members)
+        start, fault = start_members(alone, key, key_differs, members)
         recorder = Recorder(dynamics, inputs.constants.units, None)
         first_key = key[0] if key_differs else key
         result = run_traced(recorder, inputs.times, start, first_key, None, fault)
-        return by_member(result, members)
+        return split_members(result, members)
 
     @eqx.filter_jit
     def _curve(
@@ -284,16 +284,31 @@ class AbstractParticleModel(AbstractModel):
         return dataclasses.replace(curve, saved=saved._replace(box_side=box_side))
 
 
-def _start_of_members(
-    alone: AbstractDynamics, key: Array, key_differs: bool, members: int
-) -> tuple[Any, Int[Array, ""]]:
-    """Return the random starts of members of a batch in one array, and their faults.
+def _unreachable_with_drag(gas: Gas, times: Float[Array, "times"]) -> Bool[Array, "times"]:
+    """Return a mask of the times that particle models with drag cannot reach.
 
-    The members have a common start, as one of them would have alone, or one for each key.
+    Raises:
+        ValueError: if gas and times are known, and some times are too late.
     """
-    if not key_differs:
-        start, fault = start_traced(alone, key)
-        return jax.tree.map(lambda x: jnp.tile(x, (members, 1)), start), fault
-    starts, faults = jax.vmap(partial(start_traced, alone))(key)
-    start = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), starts)
-    return start, jnp.bitwise_or.reduce(faults)
+    if gas.drag is None:
+        return jnp.zeros(times.shape, bool)
+    limit = float(-0.5 * np.log(np.finfo(times.dtype).eps))  # beyond it 1 - gamma s is 0
+    too_late = gas.drag.rate * times > limit
+    if is_known(too_late) and np.any(np.asarray(too_late)):
+        raise ValueError(
+            f"drag has slowed the gas by exp(-{float(gas.drag.rate * times[-1]):.3g}) at the last "
+            f"time; particle models are exact up to exp(-{limit:.3g}). "
+            f"End before t = {limit / float(gas.drag.rate):.4g} s, or use KineticTheory()."
+        )
+    return too_late
+
+
+def _refuse_files(model: AbstractModel, run: Run) -> None:
+    """Raise ValueError if a compiled run should write files."""
+    for name in ("checkpoint", "trajectory"):
+        path = getattr(run, name)
+        if path is not None:
+            raise ValueError(
+                f"inside jax.jit and jax.vmap {type(model).__name__} cannot write a {name}, got "
+                f"{str(path)!r}. Set {name}=None."
+            )

@@ -14,6 +14,7 @@ import numpy as np
 from equinox import AbstractClassVar, AbstractVar
 from jaxtyping import Array, Float
 
+from jaxgran._utils.tracing import any_traced
 from jaxgran._utils.validation import POSITIVE, Domain, checked_float, checked_int
 from jaxgran.gradients.differences import by_differences
 from jaxgran.gradients.rule import Result, differentiable
@@ -26,6 +27,7 @@ from jaxgran.particles.snapshot import Units
 from jaxgran.particles.spheres import AbstractSphereDynamics
 from jaxgran.particles.start import check_inside, check_start
 from jaxgran.scene.gas import Gas
+from jaxgran.scene.geometry import MIN_BOX, PACKING_LIMIT
 from jaxgran.scene.reduced import SphereScene
 
 S = TypeVar("S", bound="AbstractSpheres")
@@ -143,7 +145,7 @@ class AbstractSpheres(AbstractParticleModel):
                 f"{', '.join(gas.elements)}. Leave differences out of the model, or take "
                 "differences of runs yourself."
             )
-        checks.check_packing(gas, self.num_particles, random=self.start is None)
+        _check_packing(gas, self.num_particles, random=self.start is None)
         checks.check_volume(gas, self.num_particles)
         if self.start is None:
             return
@@ -303,14 +305,39 @@ class AbstractSpheres(AbstractParticleModel):
         law = self.laws_of_replicas(laws, differs.material.law)
         if law is None:
             return None
-        together = scene._replace(
+        merged_scene = scene._replace(
             contact_duration=jnp.min(scene.contact_duration),
             material=scene.material._replace(law=law),
         )
         multiple = math.ceil(members / SIZED_MEMBERS)
-        longer = sizes._replace(capacity=sizes.capacity.of_members(multiple))
+        longer = sizes._replace(capacity=sizes.capacity.of_batch(multiple))
         engine = choose_engine(self.neighbours, sizes.engine, traced=True)
-        return self.motion(together, (replicas, self.num_particles, dimension), longer, engine)
+        shape = replicas, self.num_particles, dimension
+        return self.motion(merged_scene, shape, longer, engine)
+
+
+def _check_packing(gas: Gas, num_particles: int, random: bool) -> None:
+    """Raise ValueError if the gas is too dense for a random start, or the box too small."""
+    if any_traced(gas.packing_fraction, gas.diameter):
+        return
+    limit = PACKING_LIMIT[gas.dimension]
+    phi = float(jnp.max(gas.packing_fraction))
+    if phi > limit and random:
+        raise ValueError(
+            f"packing_fraction {phi:.3g} is too dense for a fluid start, at most {limit:g} is "
+            "allowed. Lower it, or give your own start."
+        )
+    side = float(jnp.min(gas.box_side(num_particles) / gas.diameter))
+    if side == 0:
+        raise ValueError(
+            f"diameter {float(jnp.min(gas.diameter)):g} m is so small that the volume of a sphere "
+            f"is 0 in {gas.diameter.dtype}. Check its unit."
+        )
+    if side < MIN_BOX:
+        raise ValueError(
+            f"the box is {side:.3g} diameters long, at least {MIN_BOX} are needed to distinguish "
+            "a sphere from its image. Use more particles or a lower packing_fraction."
+        )
 
 
 def _differs_in_law_alone(differs: SphereScene) -> bool:

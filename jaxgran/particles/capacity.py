@@ -74,7 +74,7 @@ class Capacity(NamedTuple):
         in_list = status.flag(status.LIST_FULL, jnp.any(full[:2]))
         return in_list | status.flag(status.CONTACTS_FULL, jnp.any(full[2:]))
 
-    def of_members(self, members: int) -> "Capacity":
+    def of_batch(self, members: int) -> "Capacity":
         """Return a capacity for several such gases in one array."""
         rows = (members * x for x in self)
         return Capacity(*rows)._replace(lookahead=self.lookahead)

@@ -23,7 +23,12 @@ from jaxgran.scene.elements import (
     WhiteNoise,
     check_elements,
 )
-from jaxgran.scene.geometry import CLOSE_PACKING, contact_value, sphere_surface
+from jaxgran.scene.geometry import (
+    CLOSE_PACKING,
+    contact_value,
+    scaled_critical_wavenumber,
+    sphere_surface,
+)
 from jaxgran.scene.parameter_fields import (
     ParameterField,
     element_fields,
@@ -39,7 +44,6 @@ from jaxgran.scene.parameters import (
     optional_number_named,
     unit_of,
 )
-from jaxgran.scene.shear_instability import scaled_critical_wavenumber
 
 PACKING_DOMAINS = {d: Domain(0.0, close) for d, close in CLOSE_PACKING.items()}
 """Allowed packing fractions, by dimension."""
@@ -460,7 +464,7 @@ class Gas(eqx.Module):
         ``k_c sigma = n sigma^3 sqrt((32 pi/15) I f)`` (3D) or ``n sigma^2 sqrt(pi I f)`` (2D). Here
         ``I = <1 - eps^2>`` is weighted by the energy of the normal motion, and the density factor
         ``f = g_2^2/(1 + a_1 y + a_2 y^2)`` follows from Enskog's viscosity of elastic spheres in
-        the first Sonine approximation (see `jaxgran.scene.shear_instability`).
+        the first Sonine approximation (`SHEAR_VISCOSITY` in `jaxgran.scene.geometry`).
 
         In a periodic box longer than L_c a flow grows relative to the thermal motion. Clusters form
         later, when the flow is strong enough to sweep the spheres together. In two-dimensional

@@ -1,5 +1,6 @@
-"""Geometry of equal spheres: surface, mass, packing, and the pair correlation at contact.
+"""Spheres in a box: geometry, pair correlation at contact, shear waves, and speeds of impacts.
 
+`scaled_critical_wavenumber` is the wavenumber below which shear waves of a cooling gas grow.
 `impact_average` is the average over the normal speeds of the impacts in a gas.
 """
 
@@ -24,6 +25,14 @@ spheres freeze at slightly larger ones."""
 MIN_BOX = 2.1
 """Least side of a box in diameters; in a smaller one a sphere could touch another one and its image
 at once."""
+
+SHEAR_VISCOSITY = {2: (2.0, 1.0, 0.8729), 3: (4.0, 0.8, 0.7614)}
+"""Coefficients b, a_1, a_2 of Enskog's shear viscosity, by dimension.
+
+``eta g_2 / eta_0 = 1 + a_1 y + a_2 y^2`` with ``y = b phi g_2``.
+
+Reference: Gass 1971 (2D); Chapman & Cowling, Eq. 16.41.7 (3D).
+"""
 
 
 def sphere_surface(dimension: int) -> float:
@@ -126,6 +135,28 @@ def contact_value_slopes(
         return by_diameter, 4.5 * phi * (1 + phi) / ((1 - phi) ** 3 * g_2)
     by_diameter = 2 * phi * (2 / (1 - phi) - 7 / (16 - 7 * phi))
     return by_diameter, (16 / 3 - 25 / 8) * phi
+
+
+def scaled_critical_wavenumber(
+    packing_fraction: Float[Array, ""], dimension: int
+) -> Float[Array, ""]:
+    """Critical wavenumber ``k_c sigma/sqrt(I)``, below which shear waves of a cooling gas grow.
+
+    ``n sigma^3 sqrt(32 pi f/15)`` in three dimensions and ``n sigma^2 sqrt(pi f)`` in two, with
+    ``f = g_2^2/(1 + a_1 y + a_2 y^2)`` by `SHEAR_VISCOSITY`. I = <1 - eps^2> is weighted by the
+    energy of the normal motion; see `Gas.critical_box`.
+
+    Args:
+        packing_fraction: phi.
+        dimension: d, 2 or 3.
+    """
+    g_2 = contact_value(packing_fraction, dimension)
+    phi = packing_fraction
+    b, a_1, a_2 = SHEAR_VISCOSITY[dimension]
+    y = b * phi * g_2
+    dense = g_2**2 / (1 + a_1 * y + a_2 * y**2)
+    density = phi * dimension * 2**dimension / sphere_surface(dimension)
+    return density * jnp.sqrt((32 * pi / 15 if dimension == 3 else pi) * dense)
 
 
 def _quadrature(num_nodes: int, max_speed: float) -> tuple[np.ndarray, np.ndarray]:

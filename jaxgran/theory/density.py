@@ -11,9 +11,8 @@ from jaxtyping import Array, Float
 
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.geometry import contact_value_slopes, sphere_surface
+from jaxgran.scene.geometry import contact_value_slopes, scaled_critical_wavenumber, sphere_surface
 from jaxgran.scene.laws import ReducedLaw
-from jaxgran.scene.shear_instability import scaled_critical_wavenumber
 
 MAX_WAVENUMBER = {2: (0.181, 3.10), 3: (0.926, 2.19)}
 """a, b of ``K sigma = a + b phi``, the largest wavenumber that is counted, by dimension.

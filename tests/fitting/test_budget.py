@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.models.choose import error_model_of
+from jaxgran.models.choose import predict_error_model
 from tests.beads import glass_beads, soft_beads
 from tests.fitting.curves import BOTH, cooled_beads, fitted, in_range, synthetic
 
@@ -110,21 +110,23 @@ def test_derivatives_through_a_flow_are_known_worse():
     gas = soft_beads(0.05, 0.2, packing_fraction=0.3)
     end = 3000 * float(gas.mean_free_time)
     for model in (jaxgran.SoftSpheres(1000), jaxgran.HardSpheres(1000)):
-        error_model = error_model_of(gas, end, 1000)
+        error_model = predict_error_model(gas, end, 1000)
         error = model.derivative_error(error_model)
         bias = np.interp([*measured], error_model.collisions, error)
         assert np.all(np.abs(np.log(bias / [*measured.values()])) < np.log(2))
-    small = error_model_of(gas, end, 100)
+    small = predict_error_model(gas, end, 100)
     assert float(gas.box_side(100)) < float(gas.critical_box)
     assert not np.any(jaxgran.SoftSpheres(100).derivative_error(small))
-    assert jaxgran.DSMC(1000).derivative_error(error_model_of(gas, end, 1000)) == 0
+    assert jaxgran.DSMC(1000).derivative_error(predict_error_model(gas, end, 1000)) == 0
 
 
 def test_errors_between_walls_are_those_measured():
     gas = glass_beads(packing_fraction=0.03)
     walled = dataclasses.replace(gas, container=jaxgran.Walls(gas.box_side(250), restitution=0.9))
     elastic = walled.replace(wall_coefficient=1.0)
-    walled, elastic = (error_model_of(x, end=0.1, num_particles=250) for x in (walled, elastic))
+    walled, elastic = (
+        predict_error_model(x, end=0.1, num_particles=250) for x in (walled, elastic)
+    )
     at_walls, at_elastic_walls = np.asarray(walled.mixing), np.asarray(elastic.mixing)
     assert 0.012 < at_walls[0] < 0.013 and 0.004 < at_elastic_walls[0] < 0.005
     fallen = np.exp(walled.log_temperature[-1])

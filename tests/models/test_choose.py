@@ -183,6 +183,15 @@ def test_the_noise_is_that_of_the_models_that_were_given():
         jaxgran.choose_model(gas, times, models=[])
 
 
+@pytest.mark.parametrize("number", [0, -5, 200.5, True])
+def test_the_number_of_particles_is_checked_with_given_models(number):
+    gas = glass_beads()
+    with pytest.raises(ValueError, match="num_particles must be a whole number >= 1"):
+        jaxgran.choose_model(
+            gas, over(gas, 10.0), num_particles=number, models=[jaxgran.KineticTheory()]
+        )
+
+
 def test_a_gas_too_soft_for_theory_is_refused():
     soft = glass_beads().replace(youngs_modulus=1e-3)
     with pytest.raises(ValueError, match="overlap by .* at T_0"):
