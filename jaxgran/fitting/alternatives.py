@@ -425,7 +425,7 @@ class _Summary(NamedTuple):
         if is_excluded:
             return alternative
         beyond = max(beside.low[0] - allowed.low[0], allowed.high[0] - beside.high[0])
-        widening = beyond / magnitude_of(beside.estimate[0])
+        widening = beyond / magnitude_of(float(beside.estimate[0]))
         return alternative._replace(
             distinguishable=bool(widening < DISTINGUISHABLE_SHARE),
             error_reduction_needed=float(max(widening / DISTINGUISHABLE_SHARE, 1.0)),
