@@ -450,8 +450,8 @@ def test_a_constant_restitution_is_named_and_A_has_no_meaning_then():
     result = without_chance(gas, exact_to(constant, 0))
     found = next(a for a in result.alternatives if a.restitution is not None)
     assert found.preferred and found.restitution == pytest.approx(0.9, abs=0.002)
-    assert f"coefficient of restitution, {found.restitution:.3g}, explains" in result.headline
-    assert "the data better: then A has no meaning" in result.headline
+    assert f"constant restitution, eps = {found.restitution:.3g}, explain" in result.headline
+    assert "the data better; A would then have no meaning" in result.headline
     # It is no part of the range, and not named where it does not explain the curve.
     (estimate,) = result.ranges[A][0]
     assert estimate < result.estimate[0]
