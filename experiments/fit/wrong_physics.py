@@ -39,7 +39,6 @@ import jaxgran
 from experiments.support.analysis import fit_quietly
 from experiments.support.record import Options, collected, each_alone, figures, run_parts
 from experiments.support.scenes import cool, glass
-from jaxgran.fitting.alternatives import AND
 
 TRUE_A, NUM_PARTICLES, PHI = 3e-6, 250, 0.03
 NUM_POINTS, LAST = 30, 0.03
@@ -229,7 +228,7 @@ def statistics(number: int, runs: int) -> dict:
         numbers = *result.value("dissipative_constant"), *ends
         found.append((*(float(np.squeeze(x)) / TRUE_A for x in numbers), result.grade))
         for alternative in result.alternatives:
-            if AND not in alternative.name and alternative.restitution is None:
+            if alternative.num_parts == 1 and alternative.restitution is None:
                 lows[alternative.name].append(float(alternative.low[0]) / TRUE_A)
     *numbers, grades = zip(*found, strict=True)
     A, error, low, high = np.array(numbers)

@@ -1,11 +1,13 @@
 """Drop tests: normal and tangential restitution of single impacts at known speeds."""
 
+from collections.abc import Iterable
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxgran._utils.validation import (
@@ -34,13 +36,13 @@ OBLIQUE = ("tangential_speed", "tangential_restitution", "tangential_error")
 
 COSINE = Domain(-1, 1, True, True)
 
-OF_SPEEDS = {
+DOMAINS_OF_SPEED_ERRORS = {
     "speed_error": NON_NEGATIVE,
     "correlation": COSINE,
     "tangential_speed_error": NON_NEGATIVE,
     "tangential_correlation": COSINE,
 }
-"""Domains of the fields that say how well the speeds are known."""
+"""Allowed values of the fields that say how well the speeds are known."""
 
 
 def _floats_or_none(value: UserNumber | None) -> Array | None:
@@ -75,15 +77,17 @@ class DropTest(eqx.Module):
         speed_error: standard error of each speed, m/s, shape (n,), >= 0, where eps is the ratio of
             two measured speeds; `error` is then the error of the speed after the impact, over the
             speed before it. None if the speeds are known.
-        correlation: of the errors of the speeds before and after, shape (n,), in [-1, 1]; None
-            for 0.
+        correlation: of the errors of the speed before and of the speed after an impact, shape
+            (n,), in [-1, 1]; None for 0.
         tangential_speed_error: standard error of each tangential speed, m/s, shape (n,), >= 0,
             where eps_t is the ratio of two measured velocities; `tangential_error` is then the
             error of the velocity after, over the speed before. None if these speeds are known.
-        tangential_correlation: of the errors of the normal and the tangential speed before, shape
-            (n,), in [-1, 1], as the error of an angle makes it; None for 0.
+        tangential_correlation: of the errors of the normal and of the tangential speed, both
+            before an impact, shape (n,), in [-1, 1], as the error of an angle makes it; None for 0.
         scatters: whether eps scatters from impact to impact by more than its error, as rough
             surfaces make it; a fit then estimates the standard deviation of this scatter.
+
+    Traced values are not checked; lengths of lists always are.
 
     Raises:
         ValueError: for a value out of its range, or lists of different lengths.
@@ -128,38 +132,53 @@ class DropTest(eqx.Module):
         check_bool(of_centres=self.of_centres, scatters=self.scatters)
         if self.onto not in PARTNERS:
             raise ValueError(f"onto must be one of {', '.join(PARTNERS)}, got {self.onto!r}")
-        given = [name for name in OBLIQUE if getattr(self, name) is not None]
+        self._check_oblique()
+        of_errors = self._given(DOMAINS_OF_SPEED_ERRORS)
+        names = ["speed", "restitution", "error", *self._given(OBLIQUE), *of_errors]
+        for name in names:
+            if name not in ("restitution", "tangential_restitution"):
+                domain = DOMAINS_OF_SPEED_ERRORS.get(name, POSITIVE)
+                domain.check(name, getattr(self, name), self.advice[name])
+        self._check_shapes(names)
+        self._check_restitution("restitution", self._error_with(self.restitution), 0.0)
+        if self.is_oblique:
+            error = self._tangential_error_with(0.0, self.tangential_restitution)
+            self._check_restitution("tangential_restitution", error, -1.0)
+
+    def _given(self, names: Iterable[str]) -> list[str]:
+        return [name for name in names if getattr(self, name) is not None]
+
+    def _check_oblique(self) -> None:
+        """Check that all fields of oblique impacts are given, or none."""
+        given = self._given(OBLIQUE)
         if given and len(given) < len(OBLIQUE):
             raise ValueError(f"{', '.join(OBLIQUE)} are given together, got {', '.join(given)}")
-        positive = ["speed", "error"] + [x for x in given if x != "tangential_restitution"]
-        for name in positive:
-            POSITIVE.check(name, getattr(self, name), self.advice[name])
-        domains = {x: domain for x, domain in OF_SPEEDS.items() if getattr(self, x) is not None}
-        if not given and (needless := [x for x in domains if x.startswith("tangential")]):
-            raise ValueError(f"{needless[0]} needs oblique impacts: give {', '.join(OBLIQUE)}, too")
-        for name, domain in domains.items():
-            domain.check(name, getattr(self, name), self.advice[name])
-        names = ["speed", "restitution", "error", *given, *domains]
+        for name in self._given(DOMAINS_OF_SPEED_ERRORS):
+            if name.startswith("tangential") and not given:
+                raise ValueError(f"{name} needs oblique impacts: give {', '.join(OBLIQUE)}, too")
+
+    def _check_shapes(self, names: list[str]) -> None:
         shapes = [np.shape(getattr(self, name)) for name in names]
         if len(shapes[0]) != 1 or len(set(shapes)) > 1 or shapes[0] == (0,):
             raise ValueError(
                 f"{', '.join(names[:-1])} and {names[-1]} must be lists of equal length, with at "
                 f"least one impact; got shapes {', '.join(map(str, shapes))}"
             )
-        self._check_range("restitution", self.errors_of_ratio(), 0.0)
-        if self.is_oblique:
-            error = np.asarray(self._tangential_error_with(0.0, self.tangential_restitution))
-            self._check_range("tangential_restitution", error, -1.0)
 
-    def _check_range(self, name: str, error: np.ndarray, low: float) -> None:
+    def _check_restitution(self, name: str, error: Array, low: float) -> None:
+        """Check that a restitution lies in [low, 1] within its error, unless one is traced."""
+        if isinstance(error, Tracer) or isinstance(getattr(self, name), Tracer):
+            return
         value = np.asarray(getattr(self, name))
-        outside = ~((value <= 1 + MAX_SIGMAS * error) & (value >= low - MAX_SIGMAS * error))
+        error_bar = np.asarray(error)
+        margin = MAX_SIGMAS * error_bar
+        outside = ~((value <= 1 + margin) & (value >= low - margin))
         if np.any(outside):
             i = int(np.argmax(outside))
             limit = "most 1" if value[i] > low else f"least {low:g}"
             raise ValueError(
-                f"{name} must be at {limit} within its error, got {value[i]:g} +- {error[i]:g}. "
-                f"{self.advice[name]}"
+                f"{name} must be at {limit} within its error, got {value[i]:g} +- "
+                f"{error_bar[i]:g}. {self.advice[name]}"
             )
 
     @property
@@ -174,16 +193,16 @@ class DropTest(eqx.Module):
 
     def errors_of_ratio(self) -> Float[np.ndarray, "n"]:
         """Return the standard error of each eps, the error of the speed before included."""
-        return np.asarray(self._error_with(np.asarray(self.restitution)))
+        return np.asarray(self._error_with(self.restitution))
 
-    def _error_with(self, slope: Array | np.ndarray) -> Float[Array, "n"]:
+    def _error_with(self, slope: Any) -> Float[Array, "n"]:
         """Return the error of the speed after minus `slope` times that before, over the latter."""
         error = jnp.asarray(self.error)
         if self.speed_error is None:
             return error
-        relative = slope * jnp.asarray(self.speed_error) / jnp.asarray(self.speed)
-        shared = 0.0 if self.correlation is None else jnp.asarray(self.correlation)
-        return jnp.sqrt(error**2 + relative**2 - 2 * shared * error * relative)
+        relative = jnp.asarray(slope) * jnp.asarray(self.speed_error) / jnp.asarray(self.speed)
+        before_after = 0.0 if self.correlation is None else jnp.asarray(self.correlation)
+        return jnp.sqrt(error**2 + relative**2 - 2 * before_after * error * relative)
 
     def _tangential_error_with(self, by_normal: Any, by_tangential: Any) -> Float[Array, "n"]:
         """Return the error of eps_t, by derivatives of the tangential velocity after an impact.
@@ -193,12 +212,13 @@ class DropTest(eqx.Module):
         """
         errors = self.speed_error, self.tangential_speed_error
         normal, tangential = (0.0 if x is None else jnp.asarray(x) for x in errors)
-        shared = 0.0 if self.tangential_correlation is None else self.tangential_correlation
+        correlation = self.tangential_correlation
+        normal_tangential = 0.0 if correlation is None else jnp.asarray(correlation)
         before = jnp.asarray(self.tangential_speed)
         a = by_normal * normal / before
         b = by_tangential * tangential / before
         own = jnp.asarray(self.tangential_error)
-        return jnp.sqrt(own**2 + a**2 + b**2 + 2 * jnp.asarray(shared) * a * b)
+        return jnp.sqrt(own**2 + a**2 + b**2 + 2 * normal_tangential * a * b)
 
     def check_gas(self, gas: Gas) -> None:
         """Raise ValueError for a gas that lacks the elements on which these impacts depend."""

@@ -22,16 +22,9 @@ from jaxtyping import Float
 
 from jaxgran.fitting.goodness import SIGNIFICANCE, goodness
 from jaxgran.fitting.kinds import Kind, kinds_of
-from jaxgran.fitting.parameters import as_floats, with_parameters
+from jaxgran.fitting.parameters import magnitude_of, with_values
 from jaxgran.fitting.problem import Problem, unknown_of
-from jaxgran.fitting.profiles import (
-    ALLOWED,
-    ALLOWED_OVER_ALL,
-    Trial,
-    profile_of,
-    trial_of,
-    with_wider_rate_error,
-)
+from jaxgran.fitting.profiles import ALLOWED, ALLOWED_OVER_ALL, Trial, profile_of, trial_of
 from jaxgran.fitting.rows import WHITE
 from jaxgran.fitting.search import Minimum
 from jaxgran.scene.laws import VARIANT_SPEED
@@ -46,7 +39,8 @@ AND = ", and "
 """Between the names of effects that are added together."""
 
 THEORY_TOLERANCE = 1e3
-"""Factor of the tolerance of kinetic theory."""
+"""Factor of the tolerance of kinetic theory: its default of 1e-8 in T is far below what data show,
+and with 1e-5 each of many trials takes fewer steps in time."""
 
 NUM_BETWEEN = 40
 """Number of steps of the interpolation from one tried amplitude to the next."""
@@ -57,8 +51,8 @@ class Alternative(NamedTuple):
 
     Attributes:
         name: description of the added element or error.
-        effect: its name in ``absent`` of `jaxgran.Measurement`; "" for an error of the measurement.
-            Of several effects together it is the first one that has such a name.
+        effects: names in ``absent`` of `jaxgran.Measurement` of the elements that it adds; () for
+            an error of the measurement. Each of these absences excludes the alternative.
         amplitude: the best amplitude: the share of the initial cooling rate (walls, drag) or of
             the lowest computed T (floor), 1 + beta_t, 1/mu or mu (sliding), the relative error,
             the standard deviation of eps, or the delay of the clock over the cooling time. Of
@@ -83,7 +77,7 @@ class Alternative(NamedTuple):
     """
 
     name: str
-    effect: str
+    effects: tuple[str, ...]
     amplitude: float
     allowed: tuple[float, float]
     improvement: float
@@ -95,6 +89,16 @@ class Alternative(NamedTuple):
     error_reduction_needed: float
     restitution: float | None = None
 
+    @property
+    def effect(self) -> str:
+        """The first one of `effects`; "" if there is none."""
+        return self.effects[0] if self.effects else ""
+
+    @property
+    def num_parts(self) -> int:
+        """Number of elements and errors that it adds."""
+        return len(self.name.split(AND))
+
 
 class Explanations(NamedTuple):
     """A fitted law and its alternatives.
@@ -104,11 +108,13 @@ class Explanations(NamedTuple):
         alternatives: to it, those that fit best first.
         significant: decrease of -2 ln L from which an explanation excludes others; infinite for a
             curve that is smoother than N grains allow, of which all explanations remain.
+        not_computed: names of alternatives of which no amplitude could be computed.
     """
 
     law: Alternative
     alternatives: tuple[Alternative, ...]
     significant: float
+    not_computed: tuple[str, ...] = ()
 
     def ranges(self, absent: Collection[str] = ()) -> tuple[np.ndarray, np.ndarray]:
         """Return the 95 % range of the free parameters over all explanations.
@@ -118,22 +124,18 @@ class Explanations(NamedTuple):
         Args:
             absent: effects whose alternatives are left out.
         """
-        others = [x for x in self.alternatives if x.effect not in absent and x.restitution is None]
+        others = [
+            x for x in self.alternatives if x.restitution is None and not {*absent} & {*x.effects}
+        ]
+        is_law_rejected = any(x.preferred for x in others)
         considered = [self.law, *others]
         best = max(x.improvement for x in considered)
-        allowed = [
-            x
-            for x in considered
-            if x.improvement >= best - self.significant or (x is self.law and not self.is_rejected)
-        ]
+        allowed = [x for x in considered if x.improvement >= best - self.significant]
+        if not is_law_rejected:
+            allowed.append(self.law)
         low = np.min([x.low for x in allowed], axis=0)
         high = np.max([x.high for x in allowed], axis=0)
         return low, high
-
-    @property
-    def is_rejected(self) -> bool:
-        """Whether the data prefer an alternative in which A has a meaning to the fitted law."""
-        return any(x.preferred and x.restitution is None for x in self.alternatives)
 
 
 def compare_alternatives(
@@ -151,28 +153,30 @@ def compare_alternatives(
         None if the law cannot be computed.
     """
     problem = replace(problem, tolerance=THEORY_TOLERANCE)
-    bases = _minima(problem, minima)
+    bases = _fit_minima(problem, minima)
     if not bases:
         return None
     is_driven = any(m.scene.drive is not None for m in problem.curves)
     kinds = [] if is_driven else kinds_of(problem, bases[0].flat)
     significant = _significant_fall(problem, bases[0], len(kinds))
-    stages = _stages(problem, bases, kinds, significant)
-    trials = [trial for stage in stages for trial in stage.trials()]
+    stages = _fit_stages(problem, bases, kinds, significant)
+    trials = [trial for stage in stages for trial in stage.trials_with_A()]
     best = min([*bases, *trials], key=lambda trial: trial.value)
     summary = _Summary(problem, bases[0], best, significant, noise)
-    law = summary.law(bases)
-    by_effects: dict[tuple[Kind, ...], Alternative] = {}
+    law = summary.summarise_law(bases)
+    by_kinds: dict[tuple[Kind, ...], Alternative] = {}
     for stage in stages:
-        beside = by_effects[stage.shown] if stage.shown else law
-        for kind, trials_of_minima in stage.profiles.items():
-            effects = (*stage.shown, kind)
-            by_effects[effects] = summary.alternative(effects, trials_of_minima, beside)
-    best_first = sorted(by_effects.values(), key=lambda alternative: -alternative.improvement)
-    return Explanations(law, tuple(best_first), significant)
+        # What a stage shows is one of the alternatives of the stage before.
+        beside = by_kinds.get(stage.shown, law)
+        for kind, profiles in stage.profiles.items():
+            added = (*stage.shown, kind)
+            by_kinds[added] = summary.summarise(added, profiles, beside)
+    best_first = sorted(by_kinds.values(), key=lambda alternative: -alternative.improvement)
+    not_computed = tuple(name for stage in stages for name in stage.not_computed)
+    return Explanations(law, tuple(best_first), significant, not_computed)
 
 
-def _minima(problem: Problem, minima: list[Minimum]) -> list[Trial]:
+def _fit_minima(problem: Problem, minima: list[Minimum]) -> list[Trial]:
     """Return the minima that the data allow as trials, the deepest one first."""
     trials = [trial_of(problem, 0.0, minimum.flat, minimum.flat) for minimum in minima]
     found = sorted((t for t in trials if t is not None), key=lambda trial: trial.value)
@@ -193,16 +197,14 @@ def _significant_fall(problem: Problem, base: Trial, num_kinds: int) -> float:
     return float(scipy.stats.chi2.isf(PREFERENCE_LEVEL / max(num_kinds, 1), 1))
 
 
-def _stages(
+def _fit_stages(
     problem: Problem, bases: list[Trial], kinds: list[Kind], significant: float
 ) -> list["_Stage"]:
     """Return the alternatives to a law, then those beside each effect that they show."""
-    profiles = {
-        kind: [profile_of(problem, kind, base, base.flat) for base in bases] for kind in kinds
-    }
-    stages = [_Stage(problem, bases[0], bases[0].flat, (), profiles)]
-    while (effect := stages[-1].next_effect(significant)) is not None:
-        stage = _beside(stages[-1], effect)
+    origins = [base.flat for base in bases]
+    stages = [_Stage.build(problem, bases, origins, (), kinds)]
+    while (effect := stages[-1].find_next_effect(significant)) is not None:
+        stage = _fit_beside(stages[-1], effect)
         if stage is None:
             break
         stages.append(stage)
@@ -218,6 +220,7 @@ class _Stage(NamedTuple):
         origin: of all searches: the fitted law, with the first guesses of the amplitudes.
         shown: the effects.
         profiles: of each further effect, from each minimum.
+        not_computed: names of alternatives of which no amplitude could be computed.
     """
 
     problem: Problem
@@ -225,8 +228,40 @@ class _Stage(NamedTuple):
     origin: np.ndarray
     shown: tuple[Kind, ...]
     profiles: dict[Kind, list[list[Trial]]]
+    not_computed: tuple[str, ...]
 
-    def trials(self) -> list[Trial]:
+    @classmethod
+    def build(
+        cls,
+        problem: Problem,
+        bases: list[Trial],
+        origins: list[np.ndarray],
+        shown: tuple[Kind, ...],
+        kinds: list[Kind],
+    ) -> "_Stage":
+        """Fit with the amplitudes of all kinds of alternatives.
+
+        Args:
+            problem, shown: see the class.
+            bases: fits without a further effect, the best one first.
+            origins: of the searches from each of them.
+            kinds: of further effects.
+        """
+        profiles: dict[Kind, list[list[Trial]]] = {}
+        not_computed = []
+        for kind in kinds:
+            found = [
+                profile_of(problem, kind, base, origin)
+                for base, origin in zip(bases, origins, strict=True)
+            ]
+            # Each profile contains the fit without the alternative, too.
+            if any(len(trials) > 1 for trials in found):
+                profiles[kind] = found
+            else:
+                not_computed.append(_name_of((*shown, kind)))
+        return cls(problem, bases[0], origins[0], shown, profiles, tuple(not_computed))
+
+    def trials_with_A(self) -> list[Trial]:
         """Return all trials in which A has a meaning."""
         return [t for kind in self.profiles if kind.keeps_A for t in self.trials_of(kind)]
 
@@ -238,7 +273,7 @@ class _Stage(NamedTuple):
         """Return the best fit with a kind of alternatives."""
         return min(self.trials_of(kind), key=lambda trial: trial.value)
 
-    def next_effect(self, significant: float) -> Kind | None:
+    def find_next_effect(self, significant: float) -> Kind | None:
         """Return a further effect that the data show, None if there is none.
 
         It is independent errors of T, if these would exclude other effects, or the alternative that
@@ -254,15 +289,15 @@ class _Stage(NamedTuple):
             if kind.parameters == (WHITE,) and self._gain(kind) > ALLOWED_OVER_ALL:
                 return kind
         first = min(known, key=lambda kind: self.best_of(kind).value)
-        shows_element = any(kind.effect for kind in self.shown)
-        is_first_element = bool(first.effect) and not shows_element
+        shows_element = any(kind.effects for kind in self.shown)
+        is_first_element = bool(first.effects) and not shows_element
         return first if is_first_element and self._gain(first) > significant else None
 
     def _gain(self, kind: Kind) -> float:
         return self.base.value - self.best_of(kind).value
 
 
-def _beside(stage: _Stage, effect: Kind) -> _Stage | None:
+def _fit_beside(stage: _Stage, effect: Kind) -> _Stage | None:
     """Return the alternatives beside one more effect; None if it cannot be fitted.
 
     Args:
@@ -271,8 +306,11 @@ def _beside(stage: _Stage, effect: Kind) -> _Stage | None:
     """
     problem = stage.problem
     at_best = stage.best_of(effect)
-    values = effect.values_by_label(problem, at_best.amplitude)
-    guesses = {label: own.pop(effect.varied) for label, own in values.items()}
+    guesses = {}
+    fixed = {}
+    for label, values in effect.values_by_label(problem, at_best.amplitude).items():
+        guesses[label] = values[effect.varied]
+        fixed[label] = {name: x for name, x in values.items() if name != effect.varied}
     gases = {m.label: m.gas for m in problem.curves}
     labels = list(effect.curves)
     unknowns = []
@@ -283,17 +321,20 @@ def _beside(stage: _Stage, effect: Kind) -> _Stage | None:
         unknown = unknown_of(effect.varied, place, gases[label], problem.curves)
         unknowns.append(unknown)
         start.append(unknown.domain.to_free(guesses[label]) / unknown.unit)
-    wider = with_wider_rate_error(problem, effect.rate_error(at_best.amplitude))
-    fixed = problem.fixed_with(values)
-    both = replace(wider, unknowns=(*problem.unknowns, *unknowns), fixed=fixed)
+    both = replace(
+        effect.with_wider_rate_errors(problem, at_best.amplitude),
+        unknowns=(*problem.unknowns, *unknowns),
+        fixed=problem.fixed_with(fixed),
+    )
     origin = np.append(stage.origin, start)
     base = trial_of(both, 0.0, np.append(at_best.flat, start), origin)
     if base is None:
         return None
-    profiles = {
-        second: [profile_of(both, second, base, origin)] for second in kinds_of(both, base.flat)
-    }
-    return _Stage(both, base, origin, (*stage.shown, effect), profiles)
+    return _Stage.build(both, [base], [origin], (*stage.shown, effect), kinds_of(both, base.flat))
+
+
+def _name_of(effects: tuple[Kind, ...]) -> str:
+    return AND.join(kind.name for kind in effects)
 
 
 class _Allowed(NamedTuple):
@@ -326,12 +367,14 @@ class _Summary(NamedTuple):
     significant: float
     noise: Float[np.ndarray, "p"]
 
-    def law(self, bases: list[Trial]) -> Alternative:
+    def summarise_law(self, bases: list[Trial]) -> Alternative:
         """Return the law itself, from all its minima."""
-        allowed = self._allowed([[base] for base in bases], self.base.value + ALLOWED, self.base)
+        allowed = self._find_allowed(
+            [[base] for base in bases], self.base.value + ALLOWED, self.base
+        )
         return Alternative(
             name="",
-            effect="",
+            effects=(),
             amplitude=self.base.amplitude,
             allowed=allowed.amplitudes,
             improvement=0.0,
@@ -343,72 +386,72 @@ class _Summary(NamedTuple):
             error_reduction_needed=1.0,
         )
 
-    def alternative(
-        self, effects: tuple[Kind, ...], profiles: list[list[Trial]], beside: Alternative
+    def summarise(
+        self, added: tuple[Kind, ...], profiles: list[list[Trial]], beside: Alternative
     ) -> Alternative:
         """Return an alternative from its trials, interpolated between the amplitudes.
 
         Args:
-            effects: what the alternative adds; the amplitude of the last one is varied.
+            added: what the alternative adds; the amplitude of the last one is varied.
             profiles: the trials, from each minimum.
             beside: the same without the last effect.
         """
-        varied = effects[-1]
-        # The law without an alternative is not a trial of one that has no amplitudes in between.
-        ends = [trials if varied.keeps_A else trials[1:] for trials in profiles]
-        best = min((t for trials in ends for t in trials), key=lambda t: t.value, default=self.base)
-        limit = max(best.value + ALLOWED, self.best.value + ALLOWED_OVER_ALL)
-        allowed = self._allowed(profiles, limit, best)
-        low = allowed.low
-        high = allowed.high
-        restitution = None
-        widening = 0.0
+        varied = added[-1]
+        # The first trial of a profile, without the alternative, is not a fit of another law.
+        trials = [t for each in profiles for t in (each if varied.keeps_A else each[1:])]
+        best = min(trials, key=lambda trial: trial.value)
         is_excluded = best.value > self.best.value + self.significant
-        is_distinguishable = is_excluded
-        if not varied.keeps_A:
-            low = beside.low
-            high = beside.high
-            restitution = _constant_restitution(self.problem, best)
-        elif not is_excluded:
-            beyond = max(beside.low[0] - low[0], high[0] - beside.high[0])
-            widening = beyond / abs(beside.estimate[0])
-            is_distinguishable = widening < DISTINGUISHABLE_SHARE
         improvement = float(self.base.value - best.value)
-        return Alternative(
-            name=AND.join(kind.name for kind in effects),
-            effect=next((kind.effect for kind in effects if kind.effect), ""),
+        alternative = Alternative(
+            name=_name_of(added),
+            effects=tuple(dict.fromkeys(effect for kind in added for effect in kind.effects)),
             amplitude=best.amplitude,
-            allowed=allowed.amplitudes,
+            allowed=(best.amplitude, best.amplitude),
             improvement=improvement,
             estimate=self.problem.estimates(best.flat),
-            low=low,
-            high=high,
+            low=beside.low,
+            high=beside.high,
             preferred=bool(improvement - beside.improvement > self.significant),
-            distinguishable=bool(is_distinguishable),
+            distinguishable=bool(is_excluded),
+            error_reduction_needed=1.0,
+        )
+        if not varied.keeps_A:
+            return alternative._replace(restitution=_constant_restitution(self.problem, best))
+        limit = max(best.value + ALLOWED, self.best.value + ALLOWED_OVER_ALL)
+        allowed = self._find_allowed(profiles, limit, best)
+        alternative = alternative._replace(
+            allowed=allowed.amplitudes, low=allowed.low, high=allowed.high
+        )
+        if is_excluded:
+            return alternative
+        beyond = max(beside.low[0] - allowed.low[0], allowed.high[0] - beside.high[0])
+        widening = beyond / magnitude_of(float(beside.estimate[0]))
+        return alternative._replace(
+            distinguishable=bool(widening < DISTINGUISHABLE_SHARE),
             error_reduction_needed=float(max(widening / DISTINGUISHABLE_SHARE, 1.0)),
-            restitution=restitution,
         )
 
-    def _allowed(self, profiles: list[list[Trial]], limit: float, best: Trial) -> _Allowed:
+    def _find_allowed(self, profiles: list[list[Trial]], limit: float, best: Trial) -> _Allowed:
         """Return what the data allow below a limit of -2 ln L, beside other unknowns of a trial."""
         size = self.problem.num_free
-        columns = np.concatenate([self._interpolated(trials) for trials in profiles])
+        columns = np.concatenate([self._interpolate(trials) for trials in profiles])
         inside = columns[columns[:, 0] <= limit]
         value, amplitude, middle, error = np.split(inside, [1, 2, 2 + size], axis=1)
         # At each amplitude -2 ln L is a parabola in the parameters. Where one of them matters so
-        # little that its logarithm has a large error, it is a parabola in its value instead: the
-        # factor exp(h), for small h, becomes 1 + 2 h, which is more than 1 + h.
+        # little that its logarithm has a large error, it is a parabola in its value instead. The
+        # factor exp(h) of such an error is therefore 1 + h + h^2/2, as it is for small h, up to
+        # h = 2, and is continued by 1 + 2 h.
         half = np.sqrt(limit - value) * error
         of_positive = np.log1p(half + np.minimum(half**2 / 2, half))
         low = middle - half
         high = middle + np.where(self._is_logarithm, of_positive, half)
         return _Allowed(
             amplitudes=(float(np.min(amplitude)), float(np.max(amplitude))),
-            low=self._in_si(np.min(low, axis=0), best),
-            high=self._in_si(np.max(high, axis=0), best),
+            low=self._to_si(np.min(low, axis=0), best),
+            high=self._to_si(np.max(high, axis=0), best),
         )
 
-    def _interpolated(self, trials: list[Trial]) -> Float[np.ndarray, "amplitudes columns"]:
+    def _interpolate(self, trials: list[Trial]) -> Float[np.ndarray, "amplitudes columns"]:
         """Return columns of trials, and between them: -2 ln L, the amplitude, the free parameters
         in their unconstrained scale, and their errors."""
         size = self.problem.num_free
@@ -422,12 +465,11 @@ class _Summary(NamedTuple):
     @property
     def _is_logarithm(self) -> np.ndarray:
         """Whether the unconstrained scale of each free parameter is a logarithm."""
-        unknowns = self.problem.unknowns
-        domains = [u.domain for u in unknowns]
+        domains = [u.domain for u in self.problem.unknowns]
         is_positive = [np.isfinite(x.low) and not np.isfinite(x.high) for x in domains]
-        return np.repeat(is_positive, [u.size for u in unknowns])[: self.problem.num_free]
+        return self.problem.per_element(is_positive)[: self.problem.num_free]
 
-    def _in_si(self, free: np.ndarray, best: Trial) -> np.ndarray:
+    def _to_si(self, free: np.ndarray, best: Trial) -> np.ndarray:
         with np.errstate(over="ignore"):
             return self.problem.estimates(np.append(free, best.flat[free.size :]))
 
@@ -437,5 +479,5 @@ def _constant_restitution(problem: Problem, trial: Trial) -> float:
     m = problem.curves[0]
     values = problem.values(trial.flat)[m.label]
     known = {name: x for name, x in values.items() if name in m.gas.domains}
-    gas = with_parameters(m.gas, as_floats(known | {"exponent": 0.0}))
+    gas = with_values(m.gas, known | {"exponent": 0.0})
     return float(gas.restitution(VARIANT_SPEED))

@@ -12,7 +12,7 @@ import scipy  # which imports scipy.stats at its first use
 
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import Measurement
-from jaxgran.fitting.alternatives import AND, DISTINGUISHABLE_SHARE, Alternative, Explanations
+from jaxgran.fitting.alternatives import DISTINGUISHABLE_SHARE, Alternative, Explanations
 from jaxgran.fitting.goodness import SIGNIFICANCE
 from jaxgran.fitting.kinds import DECLARABLE
 from jaxgran.fitting.measured_rows import UNKNOWN_NUMBER
@@ -126,6 +126,7 @@ def with_conclusions(
         _assumptions(request.model, result),
         *_absent_effects(result),
         *_limits_of_comparison(request, result),
+        *_not_computed(explanations),
         *_alternatives(result),
         *notes,
         *_surroundings(result),
@@ -207,7 +208,7 @@ def _narrowing(result: Fit, explanations: Explanations) -> Message | None:
     effects = sorted({x.effect for x in wide})
     every = [explanations.law, *explanations.alternatives]
     best = max(x.improvement for x in every)
-    best_of_others = max(x.improvement for x in every if x.effect not in effects)
+    best_of_others = max(x.improvement for x in every if not {*effects} & {*x.effects})
     if not wide or best_of_others < best - NARROWING_LOSS:
         return None
     low, high = (float(end[0]) for end in explanations.ranges(absent=effects))
@@ -326,12 +327,10 @@ def _doubt(result: Fit) -> Message | None:
     low, high = _ends(result)
     span = _range(result, low, high)
     # One without A narrows nothing: the first line says that A would have no meaning.
-    possible = [
-        x.name for x in result.alternatives if x.restitution is None and not x.distinguishable
-    ]
+    possible = [x for x in result.alternatives if x.restitution is None and not x.distinguishable]
     if possible:
-        simplest = min(possible, key=lambda name: name.count(AND))
-        return Message("possible", name=simplest, range=span)
+        simplest = min(possible, key=lambda alternative: alternative.num_parts)
+        return Message("possible", name=simplest.name, range=span)
     return span if low >= 0 and high > MAX_RATIO * low else None
 
 
@@ -488,6 +487,12 @@ def _limits_of_comparison(request: Request, result: Fit) -> Iterator[Message]:
         yield Message("driven")
     if request.model.stochastic and result.alternatives:
         yield Message("of particles")
+
+
+def _not_computed(explanations: Explanations | None) -> Iterator[Message]:
+    """Yield the alternatives of which no amplitude could be computed."""
+    if explanations is not None and explanations.not_computed:
+        yield Message("not computed", names=listed("names", explanations.not_computed))
 
 
 def _alternatives(result: Fit) -> Iterator[Message]:

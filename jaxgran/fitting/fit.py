@@ -20,8 +20,7 @@ from jaxgran.fitting.estimate import fit_without_noise
 from jaxgran.fitting.guesses import halving_time
 from jaxgran.fitting.learnt_law import describe_unvisited_knots
 from jaxgran.fitting.measured_rows import unused_displacements, unused_rotation
-from jaxgran.fitting.parameters import domain_of, with_names_of_law
-from jaxgran.fitting.priors import SHARED, SMOOTHNESS
+from jaxgran.fitting.parameters import SHARED, SMOOTHNESS, domain_of, with_names_of_law
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.setup import Request
 from jaxgran.fitting.simulated_fit import fit_through_simulations

@@ -14,8 +14,7 @@ from jaxtyping import Array, Float
 from jaxgran.data.curve import CoolingCurve, above_noise
 from jaxgran.data.drop_test import PLATE, WALL, DropTest
 from jaxgran.data.measurement import START_TIME
-from jaxgran.fitting.parameters import as_floats, with_parameters
-from jaxgran.fitting.priors import KnownTime
+from jaxgran.fitting.parameters import KnownTime, with_values
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.laws import C1, ConstantRestitution, RestitutionSpline, Viscoelastic
 from jaxgran.theory.equations import COOLING_CORRECTION, COOLING_RATE
@@ -52,9 +51,9 @@ def guess_from_data(gas: Gas, curve: CoolingCurve, free: tuple[str, ...]) -> Gas
         weight = 1 / line
         slope = np.sum(weight**2 * (line - origin) * times) / np.sum((weight * times) ** 2)
     rate = np.maximum(slope / origin, 1e-9 / times[-1])
-    values |= _guess_law(with_parameters(gas, as_floats(values)), rate, free)
+    values |= _guess_law(with_values(gas, values), rate, free)
     values |= _guess_elements(gas, curve, free)
-    return with_parameters(gas, as_floats(values))
+    return with_values(gas, values)
 
 
 def _guess_law(gas: Gas, rate: Any, free: tuple[str, ...]) -> dict[str, Any]:

@@ -17,9 +17,10 @@ from jaxgran.data.measurement import START_TIME, Measurement
 from jaxgran.fitting.drawn_errors import imitations
 from jaxgran.fitting.fit import fit
 from jaxgran.fitting.measured_rows import with_errors_that_count
+from jaxgran.fitting.parameters import magnitude_of
 from jaxgran.fitting.result import CONDITIONAL, Fit
 from jaxgran.fitting.threads import quiet_threads
-from jaxgran.fitting.twins import AS_GIVEN, Truth, magnitude_of, strongest_effect
+from jaxgran.fitting.twins import AS_GIVEN, Truth, strongest_effect
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.checks import checked_key
 from jaxgran.models.choose import choose_model

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.problem import Problem
-from jaxgran.fitting.rows import FLOOR, WHITE, CurveRows, has_no_measured_errors
+from jaxgran.fitting.rows import FLOOR, WHITE, CurveRows, DropRows, has_no_measured_errors
 from jaxgran.models.error_model import ROUGHNESS_ERROR, SLIDING_ERROR
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.laws import VISCOELASTIC_EXPONENT
@@ -132,10 +132,9 @@ class Kind:
         return self.amplitude_sets or self.parameters[0]
 
     @property
-    def effect(self) -> str:
-        """Name in `DECLARABLE`; "" for an error of the measurement or another law of impacts."""
-        names = {known.parameter: name for name, known in DECLARABLE.items()}
-        return names.get(self.parameters[0], "")
+    def effects(self) -> tuple[str, ...]:
+        """Names in `DECLARABLE` of what it adds: none for an error or another law of impacts."""
+        return tuple(x for x, known in DECLARABLE.items() if known.parameter in self.parameters)
 
     def values_by_label(self, problem: Problem, amplitude: float) -> dict[str, dict[str, float]]:
         """Return the values of parameters in each measurement that it changes."""
@@ -143,6 +142,17 @@ class Kind:
             return {label: self.values(amplitude, x) for label, x in self.curves.items()}
         any_curve = next(iter(self.curves.values()))
         return {m.label: self.values(amplitude, any_curve) for m in problem.measurements}
+
+    def with_wider_rate_errors(self, problem: Problem, amplitude: float) -> Problem:
+        """Return a problem with its error of the cooling rate added, in the curves it changes."""
+        error = self.rate_error(amplitude)
+
+        def widened(m: CurveRows | DropRows) -> CurveRows | DropRows:
+            if isinstance(m, CurveRows) and m.label in self.curves:
+                return m.with_wider_rate_error(error)
+            return m
+
+        return replace(problem, measurements=tuple(map(widened, problem.measurements)))
 
 
 def _walls(share: float, curve: FittedCurve) -> dict[str, float]:

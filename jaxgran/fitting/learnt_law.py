@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxgran._utils.validation import POSITIVE
 from jaxgran.data.curve import CoolingCurve, above_noise
-from jaxgran.fitting.parameters import as_floats, residuals_and_slopes, with_parameters
+from jaxgran.fitting.parameters import residuals_and_slopes, with_values
 from jaxgran.fitting.result import Fit
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.laws import RestitutionSpline
@@ -87,7 +87,7 @@ class RestitutionBand(NamedTuple):
         domain = gas.domains[free]
 
         def residuals(flat: np.ndarray) -> np.ndarray:
-            changed = with_parameters(gas, as_floats({free: domain.from_free(flat[0])}))
+            changed = with_values(gas, {free: domain.from_free(flat[0])})
             return whiten @ (np.asarray(_losses(changed, jnp.asarray(self.speeds))) - measured)
 
         first = np.ravel(domain.to_free(np.asarray(gas.value(free))))

@@ -69,6 +69,7 @@ MESSAGES = {
     "absent": "known to be absent: {names}",
     "quick": "alternatives were not compared, as requested",
     "driven": "alternatives were not compared: the gas is driven",
+    "not computed": "alternatives not computed: {names}; the range does not allow for them",
     "of particles": "the range over alternatives comes from kinetic theory, shifted to the fitted "
     "curve",
     "is preferred": "{name} added to the model decreases -2 ln L by {improvement:.3g}, which "

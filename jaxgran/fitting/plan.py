@@ -21,10 +21,11 @@ from jaxgran.fitting.candidates import (
 )
 from jaxgran.fitting.fit import HOW_TO_MEASURE, fit
 from jaxgran.fitting.measured_rows import with_errors_that_count
+from jaxgran.fitting.parameters import magnitude_of
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.setup import with_values_of
 from jaxgran.fitting.threads import quiet_threads
-from jaxgran.fitting.twins import AS_GIVEN, Truth, magnitude_of, truths_of, twin
+from jaxgran.fitting.twins import AS_GIVEN, Truth, truths_of, twin
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.parameters import MATERIAL, PARAMETERS, SCENE, symbol_of, unit_of
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.guesses import power_of_line
-from jaxgran.fitting.parameters import as_floats, with_parameters
+from jaxgran.fitting.parameters import as_floats, with_values
 from jaxgran.fitting.rows import CALIBRATION, FLOOR, ROTATION, SCATTER, WHITE, CurveRows
 from jaxgran.fitting.time_grid import TimeGrid, shift_with_t0, time_grid
 from jaxgran.models.base import AbstractModel
@@ -146,7 +146,7 @@ def predicted_curve(
         linearise: computes the curve.
     """
     names = values.keys() & rows.gas.domains.keys()
-    gas = with_parameters(rows.gas, as_floats({name: values[name] for name in names}))
+    gas = with_values(rows.gas, {name: values[name] for name in names})
     elapsed = np.asarray(rows.curve.times) - float(values.get(START_TIME, 0.0))
     elapsed = elapsed * rows.faster
     grid = time_grid(np.abs(elapsed), rows.unit_time)

@@ -13,9 +13,15 @@ from jaxgran.data.drop_test import SPHERE
 from jaxgran.data.measurement import START_TIME, Priors
 from jaxgran.fitting.comparison import Comparison, Residuals
 from jaxgran.fitting.guesses import halving_time
-from jaxgran.fitting.parameters import Unknown, domain_of, residuals_and_slopes
+from jaxgran.fitting.parameters import (
+    SHARED,
+    Unknown,
+    domain_of,
+    extra_parameters,
+    prior_residuals,
+    residuals_and_slopes,
+)
 from jaxgran.fitting.prediction import Element, PredictedCurve, predicted_curve, steady_curve
-from jaxgran.fitting.priors import SHARED, extra_parameters, prior_residuals
 from jaxgran.fitting.rows import FLOOR, WHITE, CurveRows, DropRows
 from jaxgran.models.base import AbstractModel
 from jaxgran.scene.gas import Gas

@@ -1,8 +1,8 @@
 """Profiles of -2 ln L: fits of all unknowns with increasing amplitudes of an alternative."""
 
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -10,15 +10,16 @@ from jaxtyping import Float
 from jaxgran.fitting.information import inverse
 from jaxgran.fitting.kinds import Kind
 from jaxgran.fitting.problem import Problem
-from jaxgran.fitting.rows import CurveRows
-from jaxgran.fitting.search import MAX_STEP, Objective, minimise, newton_step
+from jaxgran.fitting.search import Objective, minimise, newton_step
 
 ALLOWED = 3.84
-"""Increase of -2 ln L over the fitted law up to which its own parameters are allowed (5 % by
-chance)."""
+"""Increase of -2 ln L over the minimum of one explanation up to which its parameters are allowed:
+the value that chi^2 of one degree of freedom exceeds in 5 % of cases (chi2.isf(0.05, 1))."""
 
 ALLOWED_OVER_ALL = 3.84
-"""The same of all explanations over the best one."""
+"""The same over the minimum of all explanations, up to which an amplitude is allowed. It has a name
+of its own because another level of it would change which explanations are left, and not the range
+of the parameters in each of them."""
 
 EXCLUDED = 4 * ALLOWED
 """Increase beyond which larger amplitudes are not tried."""
@@ -28,21 +29,27 @@ NUM_REFINED = 2
 each minimum."""
 
 MIN_DROP = 0.25
-"""Depth of a minimum among three amplitudes, and by their parabola below the least of them, over
-`ALLOWED`, below which none is tried."""
+"""A minimum between three amplitudes is refined only if it is deeper than this, in units of
+`ALLOWED`."""
 
 BARRIER = 5.0
 """Factor of `EXCLUDED` for alternatives whose -2 ln L may have a second minimum."""
 
 MIN_SPACING = 0.05
-"""Least distance of the latter from those tried, over the distance of these."""
+"""Smallest distance of a refined amplitude from a tried one, over the distance of the outer two of
+three amplitudes."""
 
 MAX_STEPS = 20
 """Maximum number of steps of a search."""
 
 TRIAL_STEP = 1.0
-"""Length of a Newton step, in standard errors, that is the last one of a trial: it is taken without
-another curve, and -2 ln L is then known to .1."""
+"""A search ends where the next Newton step is shorter than this, in standard errors. The trial
+takes this step without another evaluation, which gives -2 ln L to 0.1."""
+
+MAX_CHANGE = 1.0
+"""Largest change of an unconstrained parameter in that step, and from the fit with one amplitude to
+the first guess with the next one: a factor e of a positive parameter. Beyond it -2 ln L is not a
+parabola, and the unknowns are not linear in the amplitude."""
 
 
 class Trial(NamedTuple):
@@ -76,15 +83,18 @@ def trial_of(
     step, length = newton_step(found)
     if length >= TRIAL_STEP:  # the search was cut short
         return Trial(amplitude, found.value, end.flat, error)
-    # A longer step leaves the region in which -2 ln L is a parabola.
-    share = min(1.0, MAX_STEP / max(float(np.max(np.abs(step))), MAX_STEP))
-    fall = (2 * share - share**2) * length**2
+    share = MAX_CHANGE / max(float(np.max(np.abs(step))), MAX_CHANGE)
     flat = Objective(problem, origin).nearest(end.flat + share * step)
+    # The parabola has its minimum at the end of the whole step, `length**2` below its value here.
+    left = end.flat + step - flat
+    fall = length**2 - float(left @ found.information @ left)
     return Trial(amplitude, found.value - fall, flat, error)
 
 
 def profile_of(problem: Problem, kind: Kind, base: Trial, origin: np.ndarray) -> list[Trial]:
-    """Return fits with increasing amplitudes, from 0, of an alternative.
+    """Return fits with increasing amplitudes of an alternative, the fit without it among them.
+
+    Amplitudes that cannot be computed are left out.
 
     Args:
         problem, kind: see `compare_alternatives`.
@@ -92,101 +102,122 @@ def profile_of(problem: Problem, kind: Kind, base: Trial, origin: np.ndarray) ->
         origin: of all searches: the fitted law. A search that began at the end of the one before
             would go on to values of A that change nothing.
     """
-
-    def fit_with(amplitude: float, first: np.ndarray) -> Trial | None:
-        added = kind.values_by_label(problem, amplitude)
-        fixed = problem.fixed_with(added)
-        changed = with_wider_rate_error(problem, kind.rate_error(amplitude))
-        return trial_of(replace(changed, fixed=fixed), amplitude, first, origin)
-
-    if not kind.keeps_A:
-        trial = fit_with(kind.amplitudes[0][0], base.flat)
-        return [base] if trial is None else [base, trial]
+    profile = _Profile(problem, kind, base, origin)
     trials = [base]
-    lowest = base.value
-    for sequence in kind.amplitudes:
-        before = base
+    for amplitudes in kind.amplitudes:
+        trials += profile.fit_sequence(amplitudes, min(trial.value for trial in trials))
+    if kind.keeps_A:
+        for _ in range(NUM_REFINED):
+            trials += profile.refine(sorted(trials, key=_amplitude))
+    return sorted(trials, key=_amplitude)
+
+
+def _amplitude(trial: Trial) -> float:
+    return trial.amplitude
+
+
+@dataclass(frozen=True)
+class _Profile:
+    """Fits with the amplitudes of an alternative.
+
+    Attributes:
+        problem, kind, base, origin: see `profile_of`.
+    """
+
+    problem: Problem
+    kind: Kind
+    base: Trial
+    origin: Float[np.ndarray, "unknowns"]
+
+    def fit(self, amplitude: float, first: np.ndarray) -> Trial | None:
+        """Fit all unknowns with an amplitude, from a first guess; None if this fails."""
+        added = self.kind.values_by_label(self.problem, amplitude)
+        wider = self.kind.with_wider_rate_errors(self.problem, amplitude)
+        fixed = self.problem.fixed_with(added)
+        return trial_of(replace(wider, fixed=fixed), amplitude, first, self.origin)
+
+    def fit_sequence(self, amplitudes: Iterable[float], lowest: float) -> list[Trial]:
+        """Fit with amplitudes further and further from 0, up to one that is excluded.
+
+        Args:
+            amplitudes: in this order.
+            lowest: -2 ln L of the best fit before.
+        """
+        excluded = EXCLUDED * (1.0 if self.kind.one_minimum else BARRIER)
+        trials = []
         previous = None
-        for amplitude in sequence:
-            first = before.flat
-            if previous is not None:
-                slope = (before.flat - previous.flat) / (before.amplitude - previous.amplitude)
-                first = before.flat + np.clip(slope * (amplitude - before.amplitude), -1.0, 1.0)
-            trial = fit_with(amplitude, first)
+        before = self.base
+        for amplitude in amplitudes:
+            trial = self.fit(amplitude, _extrapolated(previous, before, amplitude))
+            if trial is None:
+                continue
+            trials.append(trial)
+            lowest = min(lowest, trial.value)
+            if self.kind.keeps_A and trial.value > lowest + ALLOWED_OVER_ALL:
+                trials += self._fit_near_limit(before, trial, lowest)
+            if trial.value > lowest + excluded:
+                break
+            previous = before
+            before = trial
+        return trials
+
+    def refine(self, trials: list[Trial]) -> list[Trial]:
+        """Fit near each minimum of -2 ln L among trials of increasing amplitudes."""
+        found = [
+            self._fit_near_minimum(trials[k - 1 : k + 2])
+            for k in range(1, len(trials) - 1)
+            if trials[k].value < min(trials[k - 1].value, trials[k + 1].value)
+        ]
+        return [trial for trial in found if trial is not None]
+
+    def _fit_near_minimum(self, three: list[Trial]) -> Trial | None:
+        """Fit with the amplitude at the vertex of a parabola through three trials.
+
+        If the vertex is too near to a tried amplitude, one beside it takes its place.
+        """
+        x = np.array([trial.amplitude for trial in three])
+        value = np.array([trial.value for trial in three])
+        curvature, slope, _ = np.polyfit(x - x[1], value, 2)
+        drop = max(np.min(np.delete(value, 1)) - value[1], slope**2 / (4 * curvature))
+        if drop < MIN_DROP * ALLOWED:
+            return None
+        vertex = x[1] - slope / (2 * curvature)
+        if np.min(np.abs(vertex - x)) <= MIN_SPACING * (x[2] - x[0]):
+            vertex = (x[1] + (x[2] if vertex > x[1] else x[0])) / 2
+        return self.fit(vertex, three[1].flat)
+
+    def _fit_near_limit(self, inside: Trial, outside: Trial, lowest: float) -> list[Trial]:
+        """Fit with amplitudes at which -2 ln L, a parabola, exceeds its lowest value by
+        `ALLOWED_OVER_ALL`.
+
+        The last one comes within a quarter of this increase, if `NUM_REFINED` are enough.
+        """
+        increase = ALLOWED_OVER_ALL
+        trials = []
+        while inside.value <= lowest + increase < outside.value and len(trials) < NUM_REFINED:
+            root_inside = np.sqrt(inside.value - lowest)
+            root_outside = np.sqrt(outside.value - lowest)
+            share = (np.sqrt(increase) - root_inside) / (root_outside - root_inside)
+            share = float(np.clip(share, 0.05, 0.95))
+            amplitude = inside.amplitude + share * (outside.amplitude - inside.amplitude)
+            trial = self.fit(amplitude, inside.flat + share * (outside.flat - inside.flat))
             if trial is None:
                 break
             trials.append(trial)
             lowest = min(lowest, trial.value)
-            if trial.value > lowest + ALLOWED_OVER_ALL:
-                trials += _at_the_limit(fit_with, before, trial, lowest)
-            previous = before
-            before = trial
-            excluded = EXCLUDED * (1.0 if kind.one_minimum else BARRIER)
-            if trial.value > lowest + excluded:
+            if abs(trial.value - lowest - increase) < increase / 4:
                 break
-    for _ in range(NUM_REFINED):
-        trials.sort(key=lambda trial: trial.amplitude)
-        threes = [trials[k - 1 : k + 2] for k in range(1, len(trials) - 1)]
-        lowest_of_three = [x for x in threes if x[1].value < min(x[0].value, x[2].value)]
-        found = [_at_the_vertex(fit_with, three) for three in lowest_of_three]
-        trials += [trial for trial in found if trial is not None]
-    return sorted(trials, key=lambda trial: trial.amplitude)
+            if trial.value <= lowest + increase:
+                inside = trial
+            else:
+                outside = trial
+        return trials
 
 
-def with_wider_rate_error(problem: Problem, error: float) -> Problem:
-    """Return a problem with a larger error of the cooling rate of its model."""
-    if error == 0:
-        return problem
-
-    def widened(m: Any) -> Any:
-        if not isinstance(m, CurveRows):
-            return m
-        wider = m.rate_error._replace(error=m.rate_error.error + error)
-        return replace(m, rate_error=wider)
-
-    return replace(problem, measurements=tuple(widened(m) for m in problem.measurements))
-
-
-def _at_the_vertex(
-    fit_with: Callable[[float, np.ndarray], Trial | None], three: list[Trial]
-) -> Trial | None:
-    """Return the fit at the vertex of the parabola through a minimum of -2 ln L, or on its side."""
-    x = np.array([trial.amplitude for trial in three])
-    value = np.array([trial.value for trial in three])
-    curvature, slope, _ = np.polyfit(x - x[1], value, 2)
-    drop = max(np.min(np.delete(value, 1)) - value[1], slope**2 / (4 * curvature))
-    if drop < MIN_DROP * ALLOWED:
-        return None
-    vertex = x[1] - slope / (2 * curvature)
-    if np.min(np.abs(vertex - x)) <= MIN_SPACING * (x[2] - x[0]):
-        vertex = (x[1] + (x[2] if vertex > x[1] else x[0])) / 2
-    return fit_with(vertex, three[1].flat)
-
-
-def _at_the_limit(
-    fit_with: Callable[[float, np.ndarray], Trial | None],
-    low: Trial,
-    high: Trial,
-    least: float,
-) -> list[Trial]:
-    """Return fits near the amplitude at which -2 ln L, a parabola, exceeds its least value by
-    `ALLOWED_OVER_ALL`.
-
-    The last one comes within a quarter of this increase, if `NUM_REFINED` are enough.
-    """
-    increase = ALLOWED_OVER_ALL
-    trials = []
-    while low.value <= least + increase < high.value and len(trials) < NUM_REFINED:
-        at_low = np.sqrt(low.value - least)
-        at_high = np.sqrt(high.value - least)
-        share = float(np.clip((np.sqrt(increase) - at_low) / (at_high - at_low), 0.05, 0.95))
-        amplitude = low.amplitude + share * (high.amplitude - low.amplitude)
-        trial = fit_with(amplitude, low.flat + share * (high.flat - low.flat))
-        if trial is None:
-            break
-        trials.append(trial)
-        least = min(least, trial.value)
-        if abs(trial.value - least - increase) < increase / 4:
-            break
-        low, high = (trial, high) if trial.value <= least + increase else (low, trial)
-    return trials
+def _extrapolated(previous: Trial | None, before: Trial, amplitude: float) -> np.ndarray:
+    """Return a first guess of the unknowns, on the line through the last two trials."""
+    if previous is None:
+        return before.flat
+    slope = (before.flat - previous.flat) / (before.amplitude - previous.amplitude)
+    change = slope * (amplitude - before.amplitude)
+    return before.flat + np.clip(change, -MAX_CHANGE, MAX_CHANGE)

@@ -1,6 +1,6 @@
 """Rows of data that a fit compares with a model: rows of measured curves and of drop tests."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -232,6 +232,11 @@ class CurveRows:
             sample=np.asarray(self.grains.sample),
             white=np.asarray(white),
         )
+
+    def with_wider_rate_error(self, error: float) -> "CurveRows":
+        """Return the curve with a larger relative error of the model's cooling rate."""
+        wider = self.rate_error._replace(error=self.rate_error.error + error)
+        return replace(self, rate_error=wider)
 
     @property
     def nuisances(self) -> dict[str, float]:

@@ -45,9 +45,6 @@ MAX_DISTANCE_OF_OTHERS = 25.0
 """Largest change of an unconstrained parameter that `MAX_DISTANCE` does not list: a factor 7e10 of
 a positive one."""
 
-MAX_STEP = 1.0
-"""Largest step of a profile (`jaxgran.fitting.profiles`)."""
-
 MULTIMODAL_PARAMETER = "tangential_restitution"
 """Parameter in which the likelihood has several maxima: on both sides of the beta_t at which
 rotation takes most energy."""

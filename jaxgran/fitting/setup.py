@@ -12,8 +12,7 @@ from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import START_TIME, Measurement, Priors
 from jaxgran.fitting.guesses import guess_from_data, guess_from_drops, guess_start_time
 from jaxgran.fitting.measured_rows import curve_rows, with_rate_error
-from jaxgran.fitting.parameters import as_floats, with_parameters
-from jaxgran.fitting.priors import known_start_time
+from jaxgran.fitting.parameters import known_start_time, with_values
 from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.rows import CurveRows, DropRows
 from jaxgran.models.base import AbstractModel
@@ -180,7 +179,7 @@ def problem_with_rate_errors(problem: Problem, flat: np.ndarray) -> Problem:
         if isinstance(m, DropRows):
             return m
         own = {n: x for n, x in values[m.label].items() if n in m.scene.domains}
-        return with_rate_error(m, problem.model, with_parameters(m.scene, as_floats(own)))
+        return with_rate_error(m, problem.model, with_values(m.scene, own))
 
     return replace(problem, measurements=tuple(map(with_error, problem.measurements)))
 

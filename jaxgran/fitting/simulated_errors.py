@@ -11,8 +11,12 @@ from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.measurement import Priors
 from jaxgran.fitting.information import FEW_PARTICLES, SAMPLING
-from jaxgran.fitting.parameters import with_parameters
-from jaxgran.fitting.priors import SMOOTHNESS, extra_parameters, prior_residuals
+from jaxgran.fitting.parameters import (
+    SMOOTHNESS,
+    extra_parameters,
+    prior_residuals,
+    with_parameters,
+)
 from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.simulations import Search, Simulations, information_by
 from jaxgran.models.error_model import ErrorModel

@@ -92,11 +92,6 @@ class StrongestEffect(NamedTuple):
     values: dict[str, np.ndarray]
 
 
-def magnitude_of(true_value: float) -> float:
-    """Return what widths of ranges are compared with; 1 for a true value of 0, as of beta_t."""
-    return abs(true_value) or 1.0
-
-
 def truths_of(measurement: Measurement, result: Fit) -> list[Truth]:
     """Return gases that may be the real one, the given one first.
 

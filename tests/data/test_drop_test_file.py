@@ -1,5 +1,7 @@
-"""Drop tests of oblique impacts in files."""
+"""Drop tests of oblique impacts in files, and what makes a drop test."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -192,6 +194,24 @@ def test_bad_impacts_are_refused(drops_of, text, message):
 def test_speeds_in_another_unit_are_asked_about(drops_of):
     with pytest.warns(UserWarning, match=r"v_n is 30 m/s, .* is it in cm/s\? Then write v_n \(cm"):
         drops_of(OBLIQUE + "30,1,.9,.1,.2,.1\n")
+
+
+def test_traced_errors_and_restitutions_are_taken_unchecked():
+    """A derivative in what was measured may be needed, as in the error of a fit."""
+    oblique = {"tangential_speed": [0.1], "tangential_restitution": [0.2]}
+
+    def errors(error, restitution):
+        known = {"speed_error": [0.01], "correlation": [0.5]}
+        drops = jaxgran.DropTest([0.1], restitution, error, **known)
+        tangential = jaxgran.DropTest([0.1], restitution, error, **oblique, tangential_error=error)
+        return drops._error_with(drops.restitution), tangential.tangential_error
+
+    given = jnp.array([0.01]), jnp.array([0.9])
+    plain, tangential = errors(*given)
+    traced, _ = jax.jit(errors)(*given)
+    np.testing.assert_allclose(traced, plain, rtol=1e-6)  # single precision
+    slope = jax.jacobian(lambda error: errors(error, given[1])[1])(given[0])
+    assert np.shape(tangential) == (1,) and slope[0, 0] == 1.0
 
 
 def test_impacts_need_the_elements_on_which_they_depend():

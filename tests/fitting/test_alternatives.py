@@ -9,9 +9,16 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.fitting import estimate
+from jaxgran._utils.validation import Domain
+from jaxgran.fitting import alternatives, estimate, profiles
 from jaxgran.fitting.alternatives import Alternative, Explanations
 from jaxgran.fitting.conclusions import describe_search
+from jaxgran.fitting.kinds import KINDS, WALLS_ADDED, FittedCurve
+from jaxgran.fitting.measured_rows import curve_rows
+from jaxgran.fitting.parameters import Unknown
+from jaxgran.fitting.problem import Evaluation, Problem
+from jaxgran.fitting.profiles import Trial
+from jaxgran.fitting.search import MAX_DISTANCE
 from jaxgran.models.linearise import with_neutral_elements
 from jaxgran.scene.laws import ViscoelasticVariant
 from tests.beads import glass_beads
@@ -218,11 +225,11 @@ def test_the_range_holds_A_where_two_elements_are_not_told(elements, first, seco
     assert f"with {first}, in which A = {alone.estimate[0]:.3g} s." in result.verdict
 
 
-def explanation(improvement, low, high, preferred=False):
+def explanation(improvement, low, high, preferred=False, effects=()):
     ends = np.array([low]), np.array([high])
     return Alternative(
         name="",
-        effect="",
+        effects=effects,
         amplitude=1.0,
         allowed=(0.0, 1.0),
         improvement=improvement,
@@ -247,6 +254,121 @@ def test_a_range_leaves_out_what_fits_significantly_worse(improvement, preferred
     others = explanation(0.0, 0.5, 1.1), explanation(improvement, 0.8, 0.9, preferred)
     found = Explanations(law, others, significant=10.0).ranges()
     assert (found[0][0], found[1][0]) == (low, high)
+
+
+def test_an_absence_leaves_out_all_alternatives_that_contain_the_effect():
+    law = explanation(0.0, 0.95, 1.05)
+    both = explanation(0.0, 0.5, 1.1, effects=("drag", "walls"))
+    found = Explanations(law, (both,), significant=10.0)
+    for absent in ("drag", "walls"):
+        low, high = found.ranges(absent=(absent,))
+        assert (low[0], high[0]) == (0.95, 1.05)
+    assert found.ranges(absent=("friction",))[0][0] == 0.5 and both.effect == "drag"
+
+
+def test_an_effect_that_is_absent_does_not_reject_the_law():
+    law = explanation(0.0, 0.95, 1.05)
+    walls = explanation(30.0, 0.5, 0.6, preferred=True, effects=("walls",))
+    other = explanation(12.0, 0.8, 0.9)
+    found = Explanations(law, (walls, other), significant=10.0)
+    low, high = found.ranges(absent=("walls",))
+    assert (low[0], high[0]) == (0.8, 1.05)
+
+
+def test_alternatives_that_cannot_be_computed_are_named_and_not_among_the_explanations(monkeypatch):
+    def fails(problem, amplitude, first, origin):
+        return None
+
+    monkeypatch.setattr(profiles, "trial_of", fails)
+    result = fitted(*cooled_beads(1), num_particles=10**6, quick=False)
+    assert result.alternatives == () and result.ranges
+    assert "constant restitution" not in result.headline
+    (reason,) = (x for x in result.reasons if x.startswith("alternatives not computed: "))
+    assert WALLS_ADDED in reason and "a constant coefficient of restitution" in reason
+
+
+def test_amplitudes_beyond_one_that_cannot_be_computed_are_tried(monkeypatch):
+    base = Trial(0.0, 0.0, np.zeros(1), np.ones(1))
+    walls = KINDS[0]
+    failing = walls.amplitudes[0][1]
+
+    def trial_of(problem, amplitude, first, origin):
+        return None if amplitude == failing else base._replace(amplitude=amplitude)
+
+    monkeypatch.setattr(profiles, "trial_of", trial_of)
+    found = profiles.profile_of(parabola(), walls, base, base.flat)
+    rest = [x for x in walls.amplitudes[0] if x != failing]
+    assert [trial.amplitude for trial in found] == [0.0, *rest]
+
+
+def test_only_the_curves_with_an_alternative_have_its_error_of_the_rate(monkeypatch):
+    gas, curve = cooled_beads()
+    theory = jaxgran.KineticTheory()
+    measurement = jaxgran.Measurement(gas, curve)
+    rows = tuple(
+        curve_rows(label, measurement, theory, fits_T_0=False, fits_t0=False)[0]
+        for label in ("in a box", "free")
+    )
+    tried = []
+    monkeypatch.setattr(profiles, "trial_of", lambda problem, *_: tried.append(problem))
+    walls = dataclasses.replace(KINDS[0], curves={"in a box": FittedCurve(gas, 1.0, 1e-4)})
+    base = Trial(0.0, 0.0, np.zeros(1), np.ones(1))
+    profiles.profile_of(parabola(measurements=rows), walls, base, base.flat)
+    with_walls, without = tried[-1].curves
+    assert np.all(with_walls.rate_error.error > rows[0].rate_error.error)
+    assert np.array_equal(without.rate_error.error, rows[1].rate_error.error)
+
+
+def parabola(minimum=0.0, name=A, **changes):
+    """A problem of one unknown of infinite range, whose -2 ln L is (unknown - minimum)^2."""
+
+    class Parabola(Problem):
+        def evaluate(self, flat, **sources):
+            distance = flat - minimum
+            value = float(np.sum(distance**2))
+            return Evaluation(value, 2 * distance, np.eye(1), [], {})
+
+    theory = jaxgran.KineticTheory()
+    unknowns = (Unknown(name, None, (), Domain()),)
+    known = {"measurements": (), "model": theory, "simplified_model": theory, "priors": {}}
+    return Parabola(**(known | changes), unknowns=unknowns, num_free=1)
+
+
+def test_a_trial_at_the_edge_of_the_region_has_the_misfit_of_the_edge():
+    edge = MAX_DISTANCE[A]
+    problem = parabola(minimum=edge + 0.4)
+    trial = profiles.trial_of(problem, 0.0, np.array([edge - 0.1]), np.zeros(1))
+    assert trial is not None and trial.flat[0] == edge
+    assert trial.value == pytest.approx(0.4**2)  # a parabola is its own quadratic model
+    inside = profiles.trial_of(parabola(minimum=0.4), 0.0, np.array([0.1]), np.zeros(1))
+    assert inside is not None and inside.value == pytest.approx(0.0, abs=1e-12)
+
+
+def summary_of(problem, base):
+    return alternatives._Summary(problem, base, base, significant=10.0, noise=np.zeros(1))
+
+
+def test_a_widening_is_compared_with_1_where_the_estimate_is_0():
+    base = Trial(0.0, 0.0, np.zeros(1), np.full(1, 0.01))
+    summary = summary_of(parabola(name="tangential_restitution"), base)
+    law = summary.summarise_law([base])
+    assert law.estimate[0] == 0.0
+    further = base._replace(amplitude=0.05, flat=np.full(1, 0.2))
+    found = summary.summarise((KINDS[0],), [[base, further]], law)
+    # The range grows by 0.2, twice the share that is negligible.
+    assert not found.distinguishable and found.error_reduction_needed == pytest.approx(2.0)
+
+
+def test_another_law_is_allowed_at_its_own_amplitude_alone(monkeypatch):
+    monkeypatch.setattr(alternatives, "_constant_restitution", lambda *_: 0.9)
+    base = Trial(0.0, 0.0, np.zeros(1), np.ones(1))
+    summary = summary_of(parabola(), base)
+    law = summary.summarise_law([base])
+    constant = next(kind for kind in KINDS if not kind.keeps_A)
+    profile = [base, base._replace(amplitude=1.0, value=3.0)]
+    found = summary.summarise((constant,), [profile], law)
+    assert found.allowed == (1.0, 1.0) and found.restitution == 0.9
+    assert (found.low, found.high) == (law.low, law.high)
 
 
 @pytest.mark.slow

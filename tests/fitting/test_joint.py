@@ -206,7 +206,7 @@ def test_an_effect_that_one_curve_tells_stays_possible_in_another():
     both = jaxgran.fit({"told": told, "untold": untold}, progress=False)
     walls = next(x for x in both.alternatives if x.name == WALLS_ADDED)
     assert walls.preferred and in_range(both, gas.value(A))
-    assert "coefficient of restitution" not in both.headline  # walls explain the data better
+    assert "constant restitution" not in both.headline  # walls explain the data better
     free = dataclasses.replace(told, gas=gas, data=synthetic(gas), absent=("walls",))
     other = dataclasses.replace(free, data=synthetic(gas, num_points=30), absent=())
     both = jaxgran.fit({"free": free, "other": other}, progress=False)

@@ -272,6 +272,6 @@ def test_an_effect_of_amplitude_0_is_no_truth(monkeypatch):
     one = np.ones(1)
     numbers = {"amplitude": 0.0, "allowed": (0.0, 0.0), "improvement": 0.0}
     verdict = {"preferred": False, "distinguishable": True, "error_reduction_needed": 1.0}
-    absent = Alternative("walls", "walls", **numbers, estimate=one, low=one, high=one, **verdict)
+    absent = Alternative("walls", ("walls",), **numbers, estimate=one, low=one, high=one, **verdict)
     curve = twins.FittedCurve(GAS, 1.0, 1e-4)
     assert twins._with_effect(absent, 0.0, curve) is None
