@@ -20,7 +20,7 @@ import jax
 import jaxgran
 from jaxgran import plotting
 from jaxgran._utils.extras import import_extra
-from jaxgran.cli.options import FitOptions, models_by_name, parse_settings
+from jaxgran.cli.options import KINETIC_THEORY, FitOptions, models_by_name, parse_settings
 from jaxgran.cli.output import as_json, check_new, list_written, title_of
 from jaxgran.cli.page import (
     Section,
@@ -39,9 +39,6 @@ from jaxgran.fitting.report import parameter_rows, report
 from jaxgran.fitting.result import NOT_DETERMINED
 from jaxgran.models.choose import default_models
 from jaxgran.scene.parameters import BY_SYMBOL, SCENE
-
-KINETIC_THEORY = "kinetic-theory"
-"""The only model of fits of drop tests and of several measurements."""
 
 
 class Outputs(NamedTuple):

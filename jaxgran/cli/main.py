@@ -15,6 +15,7 @@ from cyclopts import App, CycloptsError, Parameter
 import jaxgran
 from jaxgran.cli.cache import use_compilation_cache
 from jaxgran.cli.options import (
+    KINETIC_THEORY,
     FitOptions,
     FreeParameter,
     ModelName,
@@ -209,8 +210,9 @@ def cool(
     from jaxgran import plotting  # needs matplotlib, which `choose` does not need
 
     size = next(n for n in (particles, given.size, NUM_PARTICLES) if n is not None)
-    chosen = models_by_name(default_models(size, replicas))[model]
-    if chosen.stochastic:
+    chosen = jaxgran.KineticTheory()
+    if model != KINETIC_THEORY:
+        chosen = models_by_name(default_models(size, replicas))[model]
         check_volume(given.gas, size)
     curve = jaxgran.cool(given.gas, given.times, model=chosen, key=jax.random.key(key))
     header = {name: x for name, x in given.header.items() if name not in OF_MEASUREMENTS}

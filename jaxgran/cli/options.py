@@ -17,6 +17,9 @@ ModelName = Literal["kinetic-theory", "dsmc", "hard-spheres", "soft-spheres"]
 """Models of `jaxgran cool`. The names are literals because making the models would start XLA before
 a command has set its options (`jaxgran.cli.cache.use_compilation_cache`)."""
 
+KINETIC_THEORY = "kinetic-theory"
+"""The model that needs no number of particles, and fits several measurements."""
+
 ModelOrAuto = Literal[ModelName, "auto"]
 """Models of `jaxgran fit`, which can also choose one."""
 

@@ -29,6 +29,16 @@ def elements_of_header(header: dict[str, str]) -> dict[str, Any]:
             that no model has: gravity, mixtures, rods, ellipsoids, cohesion and charges.
     """
     _check_supported(header)
+    elements = {}
+    for name, kinds in ELEMENTS.items():
+        kind = _kind_of_surface(header) if name == "surface" else kinds[0]
+        if arguments := _arguments(kind, header):
+            elements[name] = kind(**arguments)
+    return elements
+
+
+def _kind_of_surface(header: dict[str, str]) -> type[Rough] | type[Frictional]:
+    """Return the surface that a header describes, or could describe."""
     lasting = "tangential_damping" in header
     rough = "beta_t" in header
     if lasting and rough:
@@ -37,14 +47,12 @@ def elements_of_header(header: dict[str, str]) -> dict[str, Any]:
             "contacts). Leave out beta_t for SoftSpheres(N), or tangential_damping for the other "
             "models"
         )
-    unused = Rough if lasting or ("friction" in header and not rough) else Frictional
-    elements = {}
-    for name, kinds in ELEMENTS.items():
-        for kind in kinds:
-            arguments = {} if kind is unused else _arguments(kind, header)
-            if arguments:
-                elements[name] = kind(**arguments)
-    return elements
+    if "friction" in header and not (lasting or rough):
+        raise ValueError(
+            "the header gives friction without tangential_damping; add tangential_damping (lasting "
+            "contacts) or beta_t (instantaneous impacts; '# beta_t: guess' to fit it)"
+        )
+    return Frictional if lasting else Rough
 
 
 def _check_supported(header: dict[str, str]) -> None:
@@ -61,15 +69,19 @@ def _check_supported(header: dict[str, str]) -> None:
 
 def _arguments(kind: type, header: dict[str, str]) -> dict[str, Any]:
     """Return the arguments of an element that a header gives, {} if it gives none."""
-    keys = {field: p.symbol for field, p in fields_of(kind.__name__).items() if p.symbol}
+    key_of_field = {field: p.symbol for field, p in fields_of(kind.__name__).items() if p.symbol}
     if kind is Walls:
-        keys["restitution"] = "wall_restitution"
-    fields = {key: field for field, key in keys.items()}
-    given = [key for key in header if key in fields]
+        key_of_field["restitution"] = "wall_restitution"
+    field_of_key = {key: field for field, key in key_of_field.items()}
+    given = [key for key in header if key in field_of_key]
     if not given:
         return {}
-    required = (x.name for x in dataclasses.fields(kind) if x.default is dataclasses.MISSING)
-    if missing := [keys[x] for x in required if keys[x] not in header]:
+    required = [
+        key_of_field[field.name]
+        for field in dataclasses.fields(kind)
+        if field.default is dataclasses.MISSING
+    ]
+    if missing := [key for key in required if key not in header]:
         fitted = f", or the line '# {missing[0]}: guess' to fit it (--free {missing[0]})"
         raise ValueError(
             f"the header gives {given[0]} without {missing[0]}; add {missing[0]}"
@@ -78,10 +90,11 @@ def _arguments(kind: type, header: dict[str, str]) -> dict[str, Any]:
     values = header | {key: GUESSES[key] for key in GUESSES if header.get(key) == GUESS}
     arguments: dict[str, Any] = {}
     for key in given:
+        field = field_of_key[key]
         if key == "container_side":
-            arguments[fields[key]] = header_sides(values)
+            arguments[field] = header_sides(values)
         else:
-            arguments[fields[key]] = header_number(values, key)
+            arguments[field] = header_number(values, key)
     return arguments
 
 

@@ -49,7 +49,7 @@ GUESSES = {
 
 ABSENT = {
     "walls": ("container_side", "wall_restitution"),
-    "roughness": ("beta_t",),
+    "roughness": ("beta_t", "tangential_damping"),
     "drag": ("gamma",),
     "friction": ("friction",),
 }

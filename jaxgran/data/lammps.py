@@ -70,7 +70,7 @@ def lammps_commands(gas: Gas, diameters: Sequence[float] | None = None) -> str:
     for i, j in combinations_with_replacement(range(len(sizes)), 2):
         reduced = masses[i] * masses[j] / (masses[i] + masses[j])
         lines.append(f"pair_coeff {i + 1} {j + 1} {contact_law(law, reduced, gas.surface)}")
-    lines += _walls(gas, sizes)
+    lines += _wall_lines(gas, masses)
     # The duration grows in proportion to the diameter.
     shortest = float(gas.contact_duration) * min(sizes) / float(gas.diameter)
     lines.append(f"timestep {shortest / STEPS_OF_CONTACT:.6g}")
@@ -99,7 +99,8 @@ def contact_law(law: Viscoelastic, reduced_mass: float, surface: Frictional | Wa
     return f"{contact} limit_damping" if law.clipped else contact
 
 
-def _walls(gas: Gas, sizes: list[float]) -> list[str]:
+def _wall_lines(gas: Gas, masses: list[float]) -> list[str]:
+    """Return the walls of spheres of one mass, kg; ValueError for several."""
     walls = gas.container
     if walls is None:
         return []
@@ -109,12 +110,12 @@ def _walls(gas: Gas, sizes: list[float]) -> list[str]:
             f"walls of the law {type(law).__name__} have no counterpart in LAMMPS' viscoelastic "
             "contacts: give the walls a jaxgran.Viscoelastic law"
         )
-    if len(sizes) > 1:
+    if len(masses) > 1:
         raise ValueError(
-            f"wall/gran has one damping for all spheres, and {len(sizes)} sizes have different "
+            f"wall/gran has one damping for all spheres, and {len(masses)} sizes have different "
             "masses: give one diameter, or write a fix for the group of each size"
         )
-    of_wall = contact_law(law, float(gas.mass), walls)
+    of_wall = contact_law(law, masses[0], walls)
     sides = np.broadcast_to(np.asarray(walls.side), (gas.dimension,))
     return [
         f"fix walls_{axis} all wall/gran granular {of_wall} {axis}plane 0 {float(side)!r}"

@@ -17,7 +17,7 @@ from jaxgran.data.measurement import Measurement
 from jaxgran.data.measurement_header import arguments_of_header
 from jaxgran.scene.gas import Gas
 
-OF_NO_IMPACT = {"eta": "0.1", "T0": "0.01"}
+UNUSED_BY_IMPACTS = {"eta": "0.1", "T0": "0.01"}
 """Header entries that single impacts do not depend on, for drop tests without them."""
 
 
@@ -78,21 +78,27 @@ def read_measurement(
     with files.name_in_errors(path):
         content = read_data(path, given)
         entries = content.header
-        questions = content.questions
-        if isinstance(content.data, DropTest) and gas is None:
-            entries = OF_NO_IMPACT | entries
-            if missing := missing_keys(entries):
-                raise ValueError(
-                    f"the header of this drop test lacks {', '.join(missing)}: add them, or give "
-                    "the gas of a curve, by gas=... or by jaxgran fit CURVE.csv --drop-test"
-                )
-        if gas is None:
-            gas, more = gas_of_header(entries)
+        if gas is not None:
+            questions = ask_about_another_gas(entries, gas)
+        elif isinstance(content.data, DropTest):
+            gas, questions = _gas_of_drop_test(entries)
         else:
-            more = ask_about_another_gas(entries, gas)
-        questions += more
+            gas, questions = gas_of_header(entries)
         arguments = arguments_of_header(entries)
         measurement = Measurement(gas, content.data, rounding=content.rounding, **arguments)
-    for question in questions:
+    for question in (*content.questions, *questions):
         warnings.warn(f"{path}: {question}", stacklevel=2)
     return measurement
+
+
+def _gas_of_drop_test(header: dict[str, str]) -> tuple[Gas, list[str]]:
+    """Return the gas of a drop test, and questions about its header."""
+    unused = dict(UNUSED_BY_IMPACTS)
+    if {"N", "container_side"} <= header.keys():
+        del unused["eta"]  # which these two give
+    if missing := missing_keys(UNUSED_BY_IMPACTS | header):
+        raise ValueError(
+            f"the header of this drop test lacks {', '.join(missing)}: add them, or give the gas "
+            "of a curve, by gas=... or by jaxgran fit CURVE.csv --drop-test"
+        )
+    return gas_of_header(unused | header)

@@ -214,8 +214,10 @@ def _ending(losses: list[float], loss: Loss, size: int, noisy: bool) -> _Ending 
         noisy: whether the loss has noise.
     """
     last = losses[-1]
-    if not (np.isfinite(last) and np.all(np.isfinite(loss.gradient))):
+    if not np.isfinite(last):
         return _divergence(losses, "not finite")
+    if not np.all(np.isfinite(loss.gradient)):
+        return _divergence(losses, "where its gradient is not finite")
     if last > losses[0] + MAX_GROWTH * size and last > 2 * losses[0]:
         return _divergence(losses, f"{losses[0]:.3g} at first")
     if loss.at_minimum:

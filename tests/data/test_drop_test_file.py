@@ -232,3 +232,13 @@ def test_impacts_need_the_elements_on_which_they_depend():
         jaxgran.DropTest([0.1], [0.9], [0.01], tangential_speed=[0.1])
     wall = jaxgran.DropTest([0.1], [0.9], [0.01], "wall")
     assert float(wall.computed(jaxgran.Measurement(ROUGH, wall).gas)[0]) == pytest.approx(0.8)
+
+
+def test_a_header_with_N_and_a_container_needs_no_eta(tmp_path):
+    path = tmp_path / "drops.csv"
+    header = "# diameter: 6 mm\n# density: 2500\n# Y: 5e7\n# nu: 0.22\n# wall_restitution: 0.9\n"
+    path.write_text(f"{header}# N: 20\n# container_side: 5 cm\nv,eps,eps_err\n.1,.9,.01\n")
+    measurement = read_measurement(path)
+    volume = 20 * np.pi / 6 * 6e-3**3
+    assert measurement.gas.packing_fraction < volume / (0.05 - 6e-3) ** 3 * 1.01
+    assert "T0" not in measurement.header  # which holds what the file says

@@ -36,6 +36,13 @@ def test_walls_and_friction_have_their_lines():
     assert contact_law(GAS.law, float(GAS.mass), None) in walls[0]
 
 
+def test_walls_have_the_damping_of_the_given_diameter():
+    larger = GAS.replace(diameter=4e-3, mass=8 * GAS.mass)
+    lines = jaxgran.lammps_commands(WALLED, [4e-3]).splitlines()
+    walls = [line for line in lines if line.startswith("fix walls_")]
+    assert contact_law(GAS.law, float(larger.mass), None) in walls[0]
+
+
 def test_contacts_end_at_no_force_or_at_no_overlap():
     assert "limit_damping" in contact_law(GAS.law, 1e-5, None)
     pulling = dataclasses.replace(GAS.law, clipped=False)
