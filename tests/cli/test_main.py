@@ -22,6 +22,8 @@ def test_cool_writes_the_curve_of_the_package(scene, run):
     assert (scene / "cooling.png").read_bytes()[:8] == PNG
     status, _, err = run("cool", "scene.toml", "--until", 10)
     assert status == 2 and "exists. Name another --out" in err
+    status, out, _ = run("cool", "scene.toml", "--until", 10, "--particles", 1, "--out", "one.csv")
+    assert status == 0 and "written  one.csv" in out  # theory has no particles
 
 
 @pytest.mark.slow
