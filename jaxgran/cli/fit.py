@@ -172,7 +172,7 @@ def labels_of(paths: Sequence[Path], options: FitOptions) -> list[str]:
 
 
 def is_single(labels: Iterable[str]) -> bool:
-    """Tell whether labels are those of a single measurement."""
+    """Tell whether labels stand for a single measurement."""
     return [*labels] == [""]
 
 

@@ -243,7 +243,7 @@ def _without_factors(
 ) -> Float[Array, ""]:
     """Return -2 ln L of the first column r, ``r^T W r``, with its common factors integrated out.
 
-    The further columns F are those of the factors, which are Gaussian about 0 with the widths s.
+    The further columns F belong to the factors, which are Gaussian about 0 with the widths s.
     They add ``F s^2 F^T`` to the covariance W^-1, and ``ln det(1 + s F^T W F s)`` to -2 ln L.
     """
     flat = columns.reshape(-1, columns.shape[-1])

@@ -439,7 +439,7 @@ def _fit(name: str, measurement: Planned, **options: Any) -> Fit:
 def _range_over_truth(result: Fit, name: str, truth: Gas) -> _Range:
     """Return the range of a parameter over its magnitude; 0 to inf if there is none.
 
-    If each of several curves has the parameter for itself, that of the first curve counts.
+    If each of several curves has the parameter for itself, the first curve counts.
     """
     for title, (low, high) in result.ranges.items():
         if title.rpartition(": ")[2] == name:

@@ -85,7 +85,7 @@ class StrongestEffect(NamedTuple):
 
     Attributes:
         truth: the gas with this effect.
-        values: of the free parameters beside it, by name; {} if they are those of the fit.
+        values: of the free parameters beside it, by name; {} for the values of the fit.
     """
 
     truth: Truth

@@ -63,7 +63,7 @@ def _part_at(key: Any) -> Callable[[Any], Any]:
 
 
 def element_fields(element: Element) -> dict[str, ParameterField]:
-    """Return the parameters of an element, which for walls include those of their law.
+    """Return the parameters of an element, which for walls include the parameters of their law.
 
     Names have the prefix of the element, as "wall_side".
     """

@@ -72,7 +72,7 @@ def independent_pairs(rows: PairRows, upcoming: FirstImpacts) -> IndependentPair
 
 
 class RoundImpacts(NamedTuple):
-    """Impacts of pairs or on walls in one round; rows are those of the pairs, or all slots.
+    """Impacts of pairs or on walls in one round; rows are the pairs, or all slots.
 
     Attributes:
         happens: whether each of them does.

@@ -120,7 +120,7 @@ def _in_steps(unit: Float[Array, "replicas n d"]) -> list[Int[Array, "replicas n
 
 
 def _continued(here: list[Int[Array, "replicas n"]]) -> list[Int[Array, "replicas more"]]:
-    """Return coordinates, then those of the next image of the box, and far ones as padding."""
+    """Return coordinates, then the same in the next image of the box, and far ones as padding."""
     image = [here[0] + int(X_STEPS), *here[1:]]
     end = jnp.full((len(here[0]), 2 * WORD), jnp.iinfo(jnp.int32).max)
     return [jnp.concatenate([x, y, end], axis=1) for x, y in zip(here, image, strict=True)]
