@@ -1,8 +1,6 @@
 """Questions about files whose header and columns contradict each other."""
 
-import ast
 import re
-from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +9,7 @@ import pytest
 import jaxgran
 from jaxgran import read_measurement
 from jaxgran.data.questions import PARTS, QUESTIONS
+from tests.calls import literal_arguments
 from tests.data.curve_files import GAS, SPEED_XY, TIMES, T, said, text_of
 
 QUESTIONED = {
@@ -73,20 +72,7 @@ def test_speeds_of_drop_tests_are_asked_about(tmp_path):
         read_measurement(tmp_path / "drops.csv", gas=GAS)
 
 
-def names_in(argument):
-    """The literal names of questions in an argument."""
-    if isinstance(argument, ast.Constant):
-        return {argument.value}
-    if isinstance(argument, ast.IfExp):
-        return names_in(argument.body) | names_in(argument.orelse)
-    return set()
-
-
 def test_each_question_and_part_is_used_and_each_used_one_exists():
-    used = defaultdict(set)
-    for path in Path(jaxgran.__file__).parent.glob("data/*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-                used[node.func.id] |= set().union(*map(names_in, node.args))
+    used = literal_arguments(Path(jaxgran.__file__).parent.glob("data/*.py"))
     assert used["ask"] == {*QUESTIONS}
     assert used["part"] | used["unit_question"] == {*PARTS}
