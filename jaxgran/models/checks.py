@@ -20,7 +20,10 @@ from jaxgran.scene.elements import (
     container_volume_ratio,
 )
 from jaxgran.scene.gas import Gas
+from jaxgran.scene.geometry import MIN_BOX, PACKING_LIMIT
 from jaxgran.theory.steady_states import max_thermal_speed
+
+_max_thermal_speed = eqx.filter_jit(max_thermal_speed)
 
 
 def checked_gas(gas: Any) -> Gas:
@@ -62,8 +65,7 @@ def checked_key(key: Any) -> PRNGKeyArray | None:
     if key is None:
         return key
     if isinstance(key, jax.Array):
-        typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0
-        if typed:
+        if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0:
             return key
         if key.dtype == jnp.uint32 and key.ndim == 1:
             return jax.random.wrap_key_data(key)
@@ -90,6 +92,11 @@ def check_cools(gas: Gas) -> None:
 
 def check_softness(gas: Gas) -> None:
     """Raise ValueError if soft contacts would stop the cooling, at T_0 or at the highest T."""
+    check_softness_at(gas, _highest_temperature_ratio(gas))
+
+
+def _highest_temperature_ratio(gas: Gas) -> float:
+    """Return the largest T/T_0 to which a drive or spins may heat a gas."""
     ratio = 1.0
     if gas.drive is not None:
         with jax.ensure_compile_time_eval():
@@ -98,10 +105,7 @@ def check_softness(gas: Gas) -> None:
         share = NUM_SPIN_COMPONENTS[gas.dimension] / gas.dimension
         heated = 1 + share * float(gas.surface.rotational_temperature / gas.temperature)
         ratio = max(ratio, heated)
-    check_softness_at(gas, ratio)
-
-
-_max_thermal_speed = eqx.filter_jit(max_thermal_speed)
+    return ratio
 
 
 def check_softness_at(gas: Gas, ratio: float) -> None:
@@ -113,6 +117,36 @@ def check_softness_at(gas: Gas, ratio: float) -> None:
             f"spheres overlap by {scales.overlap:.2g} diameters at {place}, where the softness "
             "correction is invalid. Check that youngs_modulus is in Pa, use SoftSpheres, or leave "
             '"softness" out of the corrections of KineticTheory.'
+        )
+
+
+def check_packing(gas: Gas) -> None:
+    """Raise ValueError if a gas is too dense for a random start, which is a fluid."""
+    if any_traced(gas.packing_fraction):
+        return
+    limit = PACKING_LIMIT[gas.dimension]
+    phi = float(jnp.max(gas.packing_fraction))
+    if phi > limit:
+        raise ValueError(
+            f"packing_fraction {phi:.3g} is too dense for a fluid start, at most {limit:g} is "
+            "allowed. Lower it, or give your own start."
+        )
+
+
+def check_box_side(gas: Gas, num_particles: int) -> None:
+    """Raise ValueError if the box of N spheres is too small."""
+    if any_traced(gas.packing_fraction, gas.diameter):
+        return
+    side = float(jnp.min(gas.box_side(num_particles) / gas.diameter))
+    if side == 0:
+        raise ValueError(
+            f"diameter {float(jnp.min(gas.diameter)):g} m is so small that the volume of a sphere "
+            f"is 0 in {gas.diameter.dtype}. Check its unit."
+        )
+    if side < MIN_BOX:
+        raise ValueError(
+            f"the box is {side:.3g} diameters long, at least {MIN_BOX} are needed to distinguish "
+            "a sphere from its image. Use more particles or a lower packing_fraction."
         )
 
 

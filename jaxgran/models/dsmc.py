@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxgran._utils.validation import Domain, checked_float, checked_int, python_int
+from jaxgran._utils.validation import Domain, checked_float, python_int
 from jaxgran.gradients.rule import Result, differentiable
 from jaxgran.models import checks
 from jaxgran.models.base import Limitation
@@ -84,8 +84,6 @@ class DSMC(AbstractParticleModel):
     derivative_accuracy: ClassVar[float] = 0.01
 
     def __check_init__(self):
-        checked_int("num_particles", self.num_particles, 2)
-        checked_int("replicas", self.replicas, 1)
         allowed = Domain(0.0, MAX_STEP, high_allowed=True)
         checked_float("step", self.step, allowed, "A particle collides at most twice in a step.")
 
@@ -134,7 +132,7 @@ class DSMC(AbstractParticleModel):
         """Return runs with derivatives in all numbers of a scene; none of them is a frequency."""
         return differentiable(run, material=lambda scene: scene, frequency=lambda scene: None)
 
-    def merged(self, dimension: int, scene: Any, differs: Any, members: int) -> None:
+    def batch_dynamics(self, scene: Any, differs: Any, dimension: int, members: int) -> None:
         """Return no motion: particles of a batch wait for nothing."""
         return None
 

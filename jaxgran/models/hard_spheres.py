@@ -13,10 +13,11 @@ from jaxgran._utils.tracing import any_traced, concrete_array
 from jaxgran._utils.validation import Domain, checked_float, python_int
 from jaxgran.data.particles import Particles
 from jaxgran.models import checks
+from jaxgran.models.array_sizes import ArraySizes
 from jaxgran.models.base import Limitation
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.models.limitations import limitations_of_instant_impacts
-from jaxgran.models.spheres import AbstractSpheres, ArraySizes
+from jaxgran.models.spheres import AbstractSpheres
 from jaxgran.particles.capacity import capacities
 from jaxgran.particles.hard.dynamics import (
     ALLOWED_OVERLAP,
@@ -115,11 +116,11 @@ class HardSpheres(AbstractSpheres):
     _sizes: ArraySizes | None = eqx.field(static=True, default=None)
 
     listed_by_skin: ClassVar[float] = 7.0
+    sized_by: ClassVar[tuple[str, ...]] = ("num_particles", "replicas", "neighbours")
     transforms_time: ClassVar[bool] = True
     elements: ClassVar[tuple[str, ...]] = ("surface", "container", "drag", "drive")
 
     def __check_init__(self):
-        self.check_counts()
         advice = "In mean free times; it only keeps clusters from collapsing, so leave it small."
         checked_float("contact_time", self.contact_time, CONTACT_TIMES, advice)
 
@@ -137,7 +138,7 @@ class HardSpheres(AbstractSpheres):
         """
         checks.check_cools(gas)
         with jax.ensure_compile_time_eval():
-            self.check_box(gas, 0.5 - ALLOWED_OVERLAP)
+            self.check_spheres(gas, 0.5 - ALLOWED_OVERLAP)
             self._check_overlap(gas)
 
     def _check_overlap(self, gas: Gas) -> None:
@@ -194,7 +195,7 @@ class HardSpheres(AbstractSpheres):
             all_elastic=concrete_array(False),
         )
 
-    def laws_of_replicas(self, laws: Any, differs: Any) -> LawOfReplicas:
+    def law_of_replicas(self, laws: Any, differs: Any) -> LawOfReplicas:
         """Return the law of each replica."""
         return LawOfReplicas(laws)
 
@@ -221,5 +222,4 @@ class HardSpheres(AbstractSpheres):
         expected = neighbours.listed, near, chosen, 1.25 * longest
         extra = 1.3 * max(neighbours.in_contact - 0.4, 0.0)  # random positions have more near pairs
         capacity, equilibration_capacity = capacities(expected, neighbours, spare or 1.15, extra, n)
-        made_for = tuple((k, getattr(self, k)) for k in ("num_particles", "replicas", "neighbours"))
-        return ArraySizes(made_for, share, capacity, equilibration_capacity, neighbours.engine)
+        return ArraySizes(share, capacity, equilibration_capacity, neighbours.engine)

@@ -18,6 +18,7 @@ from jaxtyping import Array, Int
 from jaxgran.gradients.rule import Records, Result
 from jaxgran.particles.dynamics import AbstractDynamics
 from jaxgran.particles.run import start_traced
+from jaxgran.scene.reduced import SphereScene
 
 
 def with_batch_rule(
@@ -46,6 +47,34 @@ def with_batch_rule(
         return result, jax.tree.map(lambda _: True, result)
 
     return run_one
+
+
+def differ_in_law_alone(differs: SphereScene) -> bool:
+    """Return whether members of a batch, whose scene has True at what differs, can share arrays.
+
+    The contact duration follows from the law.
+    """
+    material = differs.material._replace(law=None)
+    others = differs._replace(material=material, contact_duration=False)
+    return not any(jax.tree.leaves(others))
+
+
+def with_axis_of_replicas(values: Any, differs: Any, members: int, replicas: int) -> Any:
+    """Return numbers with a first axis of the replicas of all members.
+
+    Args:
+        values: numbers of the members.
+        differs: the same with True at numbers that have a first axis of members.
+        members: number of members.
+        replicas: number of replicas of each.
+    """
+
+    def of_replicas(x: Array, has_axis: bool) -> Array:
+        if has_axis:
+            return jnp.repeat(x, replicas, axis=0)
+        return jnp.broadcast_to(x, (members * replicas, *jnp.shape(x)))
+
+    return jax.tree.map(of_replicas, values, differs)
 
 
 def start_members(

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from jaxgran._utils import status
 from jaxgran._utils.tracing import any_traced, is_known, nan_where
+from jaxgran._utils.validation import checked_int
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.particles import Particles
 from jaxgran.data.quantities import QUANTITIES
@@ -79,6 +80,10 @@ class AbstractParticleModel(AbstractModel):
     stochastic: ClassVar[bool] = True
     saves: ClassVar[bool] = True
 
+    def __check_init__(self):
+        checked_int("num_particles", self.num_particles, 2)
+        checked_int("replicas", self.replicas, 1)
+
     @property
     @abstractmethod
     def projected(self) -> bool:
@@ -117,15 +122,15 @@ class AbstractParticleModel(AbstractModel):
         """
 
     @abstractmethod
-    def merged(
-        self, dimension: int, scene: Any, differs: Any, members: int
+    def batch_dynamics(
+        self, scene: Any, differs: Any, dimension: int, members: int
     ) -> AbstractDynamics | None:
         """Return the motion of members of a batch as replicas in one array, without a start.
 
         Args:
-            dimension: d.
             scene: of all members in the units of the run.
             differs: the same with True at numbers that have a first axis of members.
+            dimension: d.
             members: number of members.
 
         Returns:
@@ -229,7 +234,7 @@ class AbstractParticleModel(AbstractModel):
             members: number of members.
         """
         scene_differs, inputs_differ = differs
-        dynamics = self.merged(dimension, scene, scene_differs, members)
+        dynamics = self.batch_dynamics(scene, scene_differs, dimension, members)
         others_differ = inputs_differ.times, inputs_differ.constants._replace(key=False)
         if dynamics is None or any(jax.tree.leaves(others_differ)):
             return None

@@ -11,15 +11,16 @@ import numpy as np
 import scipy  # which imports scipy.spatial at its first use
 
 from jaxgran._utils.tracing import any_traced, concrete_array
-from jaxgran._utils.validation import POSITIVE, checked_float, python_int
+from jaxgran._utils.validation import POSITIVE, checked_float, checked_int, python_int
 from jaxgran.data.particles import Particles
+from jaxgran.models.array_sizes import ArraySizes
 from jaxgran.models.base import Limitation
 from jaxgran.models.error_model import ErrorModel
-from jaxgran.models.spheres import AbstractSpheres, ArraySizes
+from jaxgran.models.spheres import AbstractSpheres
 from jaxgran.particles.capacity import capacities, grid, round_up
 from jaxgran.particles.soft.dynamics import SoftDynamics
 from jaxgran.scene.contact import elastic_constant
-from jaxgran.scene.elements import Frictional
+from jaxgran.scene.elements import Frictional, Walls
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import wrapped
 from jaxgran.scene.laws import Viscoelastic
@@ -129,11 +130,17 @@ class SoftSpheres(AbstractSpheres):
     _sizes: ArraySizes | None = eqx.field(static=True, default=None)
 
     listed_by_skin: ClassVar[float] = 3.0
+    sized_by: ClassVar[tuple[str, ...]] = (
+        "num_particles",
+        "replicas",
+        "neighbours",
+        "steps_per_contact",
+    )
     elements: ClassVar[tuple[str, ...]] = ("friction", "container", "drag")
     transforms_time: ClassVar[bool] = False
 
     def __check_init__(self):
-        self.check_counts(steps_per_contact=10)
+        checked_int("steps_per_contact", self.steps_per_contact, 10)
         if self.projection is not None:
             advice = f"It is in mean free times: {PROJECTION}, or None for the plain derivative."
             checked_float("projection", self.projection, POSITIVE, advice)
@@ -151,21 +158,9 @@ class SoftSpheres(AbstractSpheres):
                 f"{type(gas.law).__name__}. Use KineticTheory, DSMC or HardSpheres."
             )
         with jax.ensure_compile_time_eval():
-            self.check_box(gas, 0.0)
-            if (walls := gas.container) is not None:
-                if not isinstance(walls.restitution, Viscoelastic):
-                    raise ValueError(
-                        "SoftSpheres needs walls of the Viscoelastic law, which has a force "
-                        f"(elastic for A = 0); these have {type(walls.restitution).__name__}. Use "
-                        "HardSpheres, DSMC or KineticTheory, or Walls(side, "
-                        "restitution=jaxgran.Viscoelastic(...))."
-                    )
-                if walls.tangential_restitution is not None:
-                    raise ValueError(
-                        "tangential_restitution of the walls belongs to instantaneous impacts. "
-                        "Give the walls tangential_damping and friction instead, or use "
-                        "HardSpheres."
-                    )
+            self.check_spheres(gas, 0.0)
+            if gas.container is not None:
+                _check_walls(gas.container)
             self._ask_about_overlaps(gas)
 
     def _ask_about_overlaps(self, gas: Gas) -> None:
@@ -223,7 +218,7 @@ class SoftSpheres(AbstractSpheres):
         material = ReducedScene(ReducedContact.from_law(law, gas), surface, walls)
         return sphere_scene(gas, self.num_particles, material)
 
-    def laws_of_replicas(self, laws: Any, differs: Any) -> Any:
+    def law_of_replicas(self, laws: Any, differs: Any) -> Any:
         """Return the contacts of each replica; None if their stiffness, and so steps, differ."""
         if differs.alpha:
             return None
@@ -283,6 +278,19 @@ class SoftSpheres(AbstractSpheres):
         # At random positions the additional touching pairs are about those without correlation.
         extra = 1.3 * neighbours.in_contact
         capacity, equilibration_capacity = capacities(expected, neighbours, spare or 1.2, extra, n)
-        names = "num_particles", "replicas", "neighbours", "steps_per_contact"
-        made_for = tuple((name, getattr(self, name)) for name in names)
-        return ArraySizes(made_for, steps, capacity, equilibration_capacity, neighbours.engine)
+        return ArraySizes(steps, capacity, equilibration_capacity, neighbours.engine)
+
+
+def _check_walls(walls: Walls) -> None:
+    """Raise ValueError for walls without a force."""
+    if not isinstance(walls.restitution, Viscoelastic):
+        raise ValueError(
+            "SoftSpheres needs walls of the Viscoelastic law, which has a force (elastic for A = "
+            f"0); these have {type(walls.restitution).__name__}. Use HardSpheres, DSMC or "
+            "KineticTheory, or Walls(side, restitution=jaxgran.Viscoelastic(...))."
+        )
+    if walls.tangential_restitution is not None:
+        raise ValueError(
+            "tangential_restitution of the walls belongs to instantaneous impacts. Give the walls "
+            "tangential_damping and friction instead, or use HardSpheres."
+        )

@@ -1,11 +1,11 @@
-"""Base of the models of spheres in periodic boxes: checks, array sizes, derivatives and runs."""
+"""Base of the models of spheres in boxes: what hard and soft spheres accept, and how they run."""
 
 import dataclasses
 import math
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -14,50 +14,24 @@ import numpy as np
 from equinox import AbstractClassVar, AbstractVar
 from jaxtyping import Array, Float
 
-from jaxgran._utils.tracing import any_traced
-from jaxgran._utils.validation import POSITIVE, Domain, checked_float, checked_int
+from jaxgran._utils.validation import POSITIVE, Domain, checked_float
 from jaxgran.gradients.differences import by_differences
 from jaxgran.gradients.rule import Result, differentiable
 from jaxgran.models import checks
+from jaxgran.models.array_sizes import SIZED_MEMBERS, ArraySizes
 from jaxgran.models.error_model import ErrorModel, slope_bias_of_run
+from jaxgran.models.members import differ_in_law_alone, with_axis_of_replicas
 from jaxgran.models.particle_model import AbstractParticleModel
-from jaxgran.particles.capacity import Capacity, Neighbourhood
+from jaxgran.particles.capacity import Neighbourhood
 from jaxgran.particles.neighbours.lists import check_engine, choose_engine
 from jaxgran.particles.snapshot import Units
 from jaxgran.particles.spheres import AbstractSphereDynamics
 from jaxgran.particles.start import check_inside, check_start
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.geometry import MIN_BOX, PACKING_LIMIT
 from jaxgran.scene.reduced import SphereScene
-
-S = TypeVar("S", bound="AbstractSpheres")
 
 DIFFERENCE_STEPS = Domain(0.0, 0.5, high_allowed=True)
 """Allowed steps of differences: the lower value of alpha must stay positive."""
-
-SIZED_MEMBERS = 8
-"""Number of members of a batch for which the lengths of arrays are computed: more members get a
-multiple of them."""
-
-
-class ArraySizes(NamedTuple):
-    """Static sizes of the arrays of a compiled run.
-
-    Attributes:
-        made_for: fields of the model, and their values, for which the sizes are made.
-        steps: time steps in a block of soft spheres, impacts per particle in a window of hard ones.
-        capacity: sizes of the arrays of the run.
-        equilibration_capacity: sizes of the arrays in the first mean free times of equilibration.
-        engine: search for pairs in compiled code, for which `lookahead` of the sizes is made.
-        of_batch: sizes for `SIZED_MEMBERS` such gases in one array; None for known numbers.
-    """
-
-    made_for: tuple[tuple[str, Any], ...]
-    steps: Any
-    capacity: Capacity
-    equilibration_capacity: Capacity
-    engine: str
-    of_batch: "ArraySizes | None" = None
 
 
 class AbstractSpheres(AbstractParticleModel):
@@ -67,12 +41,14 @@ class AbstractSpheres(AbstractParticleModel):
         neighbours: the search for pairs.
         differences: step of derivatives by differences; None for projected ones.
         listed_by_skin: pairs per particle that the skin adds to a neighbour list.
+        sized_by: fields for which the sizes of arrays are made.
     """
 
     neighbours: AbstractVar[str]
     differences: AbstractVar[float | None]
     _sizes: AbstractVar[ArraySizes | None]
     listed_by_skin: AbstractClassVar[float]
+    sized_by: AbstractClassVar[tuple[str, ...]]
 
     has_positions: ClassVar[bool] = True
     derivative_accuracy: ClassVar[float] = 0.02
@@ -105,7 +81,7 @@ class AbstractSpheres(AbstractParticleModel):
         """Return numbers of a scene in which the derivative of a run is not known, by a message."""
 
     @abstractmethod
-    def laws_of_replicas(self, laws: Any, differs: Any) -> Any:
+    def law_of_replicas(self, laws: Any, differs: Any) -> Any:
         """Return the law of the impacts of replicas that have different ones.
 
         Args:
@@ -116,10 +92,7 @@ class AbstractSpheres(AbstractParticleModel):
             The law; None if replicas with different numbers cannot share an array.
         """
 
-    def check_counts(self, **minimum: int) -> None:
-        """Check the whole numbers of the model against their minima, and its other settings."""
-        for name, lowest in ({"num_particles": 2, "replicas": 1} | minimum).items():
-            checked_int(name, getattr(self, name), lowest)
+    def __check_init__(self):
         check_engine(self.neighbours)
         if self.differences is None:
             return
@@ -131,24 +104,25 @@ class AbstractSpheres(AbstractParticleModel):
                 "derivative. Leave one of them out."
             )
 
-    def check_box(self, gas: Gas, min_wall_distance: float) -> None:
-        """Raise ValueError for a gas too dense, a box too small, or a start of another gas.
+    def check_spheres(self, gas: Gas, min_wall_distance: float) -> None:
+        """Check the start, the derivatives and the box of a gas.
 
         Args:
             gas: the gas.
             min_wall_distance: least distance, in diameters, of a centre of the start from a wall.
         """
-        check_start(self.start, gas, self.replicas, self.num_particles)
-        if self.differences is not None and gas.elements:
-            raise ValueError(
-                "derivatives by differences need smooth spheres in free flight, and this gas has "
-                f"{', '.join(gas.elements)}. Leave differences out of the model, or take "
-                "differences of runs yourself."
-            )
-        _check_packing(gas, self.num_particles, random=self.start is None)
+        self._check_start(gas, min_wall_distance)
+        self._check_differences(gas)
+        if self.start is None:
+            checks.check_packing(gas)
+        checks.check_box_side(gas, self.num_particles)
         checks.check_volume(gas, self.num_particles)
+
+    def _check_start(self, gas: Gas, min_wall_distance: float) -> None:
+        """Raise ValueError for a start of another gas, outside of walls, or with given spins."""
         if self.start is None:
             return
+        check_start(self.start, gas, self.replicas, self.num_particles)
         if gas.container is not None:
             check_inside(self.start, gas.container, gas.diameter * min_wall_distance)
         if self.start.angular_velocity is not None:
@@ -156,6 +130,15 @@ class AbstractSpheres(AbstractParticleModel):
                 f"{type(self).__name__} draws the angular velocities of a start. Give the start "
                 "without them, start._replace(angular_velocity=None), and rotational_temperature "
                 "of the surface."
+            )
+
+    def _check_differences(self, gas: Gas) -> None:
+        """Raise ValueError for derivatives by differences in a gas with further elements."""
+        if self.differences is not None and gas.elements:
+            raise ValueError(
+                "derivatives by differences need smooth spheres in free flight, and this gas has "
+                f"{', '.join(gas.elements)}. Leave differences out of the model, or take "
+                "differences of runs yourself."
             )
 
     def check_fit(self, names: tuple[str, ...]) -> None:
@@ -207,7 +190,7 @@ class AbstractSpheres(AbstractParticleModel):
             longer=longer,
         )
 
-    def sized_for(self: S, gas: Gas, spare: float = 2.0) -> S:
+    def sized_for(self, gas: Gas, spare: float = 2.0) -> Self:
         """Return this model with fixed sizes of its arrays, for `jax.jit`.
 
         Outside of jit sizes follow from the gas, and arrays grow if they must. Inside they are
@@ -221,8 +204,10 @@ class AbstractSpheres(AbstractParticleModel):
         checked_float("spare", spare, POSITIVE, "2 is twice the expected need.")
         self.check_scene(checks.checked_gas(gas))
         needed = partial(self.needed_sizes, self.scene(gas), gas.dimension)
-        of_batch = needed(SIZED_MEMBERS * self.replicas, spare)
-        sizes = needed(self.replicas, spare)._replace(of_batch=of_batch)
+        sizes = needed(self.replicas, spare)._replace(
+            made_for=tuple((name, getattr(self, name)) for name in self.sized_by),
+            of_batch=needed(SIZED_MEMBERS * self.replicas, spare),
+        )
         return dataclasses.replace(self, _sizes=sizes)
 
     def _known_sizes(self, scene: SphereScene, dimension: int, replicas: int) -> ArraySizes:
@@ -231,7 +216,7 @@ class AbstractSpheres(AbstractParticleModel):
         The sizes of the model are for all its replicas in one array.
         """
         if self._sizes is not None:
-            self._check_made_for(self._sizes)
+            self._sizes.check_made_for(self)
             if replicas == self.replicas:
                 return self._sizes
         try:
@@ -243,16 +228,6 @@ class AbstractSpheres(AbstractParticleModel):
                 f"{type(self).__name__}(...).sized_for(gas), with a gas of known numbers and "
                 "outside of jax.jit."
             ) from None
-
-    def _check_made_for(self, sizes: ArraySizes) -> None:
-        """Raise ValueError if the settings of the model have changed since it was sized."""
-        for setting, planned in sizes.made_for:
-            value = getattr(self, setting)
-            if planned != value:
-                raise ValueError(
-                    f"this {type(self).__name__} was sized for {setting} = {planned!r}, and now "
-                    f"has {value!r}. Call sized_for(gas) again."
-                )
 
     def units(self, gas: Gas) -> Units:
         """Return the diameter and the thermal speed as units."""
@@ -287,64 +262,22 @@ class AbstractSpheres(AbstractParticleModel):
             )
         return self.motion(scene, (replicas, self.num_particles, dimension), sizes, engine)
 
-    def merged(
-        self, dimension: int, scene: SphereScene, differs: SphereScene, members: int
+    def batch_dynamics(
+        self, scene: SphereScene, differs: SphereScene, dimension: int, members: int
     ) -> AbstractSphereDynamics | None:
         """Return the motion of members that differ in their law alone; None for all others."""
-        sizes = None if self._sizes is None else self._sizes.of_batch
-        if sizes is None or not _differs_in_law_alone(differs):
+        sizes = None if self._sizes is None else self._sizes.for_members(members)
+        if sizes is None or not differ_in_law_alone(differs):
             return None
-        replicas = members * self.replicas
-
-        def of_replicas(x: Array, is_batched: bool) -> Array:
-            if is_batched:
-                return jnp.repeat(x, self.replicas, axis=0)
-            return jnp.broadcast_to(x, (replicas, *jnp.shape(x)))
-
-        laws = jax.tree.map(of_replicas, scene.material.law, differs.material.law)
-        law = self.laws_of_replicas(laws, differs.material.law)
+        differing = differs.material.law
+        laws = with_axis_of_replicas(scene.material.law, differing, members, self.replicas)
+        law = self.law_of_replicas(laws, differing)
         if law is None:
             return None
-        merged_scene = scene._replace(
+        shared_scene = scene._replace(
             contact_duration=jnp.min(scene.contact_duration),
             material=scene.material._replace(law=law),
         )
-        multiple = math.ceil(members / SIZED_MEMBERS)
-        longer = sizes._replace(capacity=sizes.capacity.of_batch(multiple))
         engine = choose_engine(self.neighbours, sizes.engine, traced=True)
-        shape = replicas, self.num_particles, dimension
-        return self.motion(merged_scene, shape, longer, engine)
-
-
-def _check_packing(gas: Gas, num_particles: int, random: bool) -> None:
-    """Raise ValueError if the gas is too dense for a random start, or the box too small."""
-    if any_traced(gas.packing_fraction, gas.diameter):
-        return
-    limit = PACKING_LIMIT[gas.dimension]
-    phi = float(jnp.max(gas.packing_fraction))
-    if phi > limit and random:
-        raise ValueError(
-            f"packing_fraction {phi:.3g} is too dense for a fluid start, at most {limit:g} is "
-            "allowed. Lower it, or give your own start."
-        )
-    side = float(jnp.min(gas.box_side(num_particles) / gas.diameter))
-    if side == 0:
-        raise ValueError(
-            f"diameter {float(jnp.min(gas.diameter)):g} m is so small that the volume of a sphere "
-            f"is 0 in {gas.diameter.dtype}. Check its unit."
-        )
-    if side < MIN_BOX:
-        raise ValueError(
-            f"the box is {side:.3g} diameters long, at least {MIN_BOX} are needed to distinguish "
-            "a sphere from its image. Use more particles or a lower packing_fraction."
-        )
-
-
-def _differs_in_law_alone(differs: SphereScene) -> bool:
-    """Return whether members of a batch, whose scene has True at what differs, can share arrays.
-
-    The contact duration follows from the law.
-    """
-    material = differs.material._replace(law=None)
-    others = differs._replace(material=material, contact_duration=False)
-    return not any(jax.tree.leaves(others))
+        shape = members * self.replicas, self.num_particles, dimension
+        return self.motion(shared_scene, shape, sizes, engine)

@@ -37,13 +37,13 @@ def test_members_are_the_gases_that_they_are_alone(case, monkeypatch):
     model, gas, name, shared = CASES[case]
     gas_at = scaled(gas, name)
     arrays = []
-    merged = spheres.AbstractSpheres.merged
+    batch_dynamics = spheres.AbstractSpheres.batch_dynamics
 
     def watched(self, *inputs):
-        arrays.append(merged(self, *inputs))
+        arrays.append(batch_dynamics(self, *inputs))
         return arrays[-1]
 
-    monkeypatch.setattr(spheres.AbstractSpheres, "merged", watched)
+    monkeypatch.setattr(spheres.AbstractSpheres, "batch_dynamics", watched)
     # Few collisions: later ones are other ones, by chaos and by other windows and steps.
     times = np.linspace(0, 0.7, 4) * float(gas.mean_free_time)
     model = model.sized_for(gas_at(2.0))

@@ -94,25 +94,6 @@ def test_a_dense_random_start_melts_under_jit(gas, model):
     np.testing.assert_allclose(curve.temperature, jaxgran.cool(gas, times).temperature, rtol=0.05)
 
 
-def test_a_plan_is_of_its_model():
-    gas = soft_beads(0.05, 0.2, packing_fraction=0.1)
-    soft, hard = (kind(100).sized_for(gas) for kind in (SoftSpheres, HardSpheres))
-    for sized, name, value in (
-        (soft, "steps_per_contact", 80),
-        (soft, "replicas", 2),
-        (hard, "replicas", 3),
-        (hard, "neighbours", "cells"),
-    ):
-        changed = dataclasses.replace(sized, **{name: value})
-        with pytest.raises(
-            ValueError, match=f"sized for {name} = .*{value}.* sized_for.gas. again"
-        ):
-            jaxgran.cool(gas, [1.0], model=changed)
-    elsewhere = SoftSpheres(100, neighbours="jax-md").sized_for(gas)
-    with pytest.raises(ValueError, match="leave neighbours out"):
-        jax.jit(lambda t: jaxgran.cool(gas, t, model=elsewhere).temperature)(jnp.array([1e-3]))
-
-
 def test_large_boxes_are_searched_by_cells():
     gas = hard_gas()
     engines = [HardSpheres(n).sized_for(gas)._sizes.engine for n in (1000, 4096, 50_000)]
