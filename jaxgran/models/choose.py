@@ -1,7 +1,7 @@
 """Choice of the fastest model whose estimated error in a scene is small enough."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from math import hypot
 from typing import NamedTuple
 
@@ -135,28 +135,9 @@ def choose_model(
     end = float(checked_times(times)[-1])
     error_model = predict_error_model(gas, end, num_particles)
     candidates = tuple(_candidate(model, error_model) for model in models)
-    possible = [(c.error, c) for c in candidates if c.error is not None]
-    if not possible:
-        refusals = "; ".join(str(c.refusal).rstrip(".") for c in candidates)
-        raise ValueError(f"no model supports this scene: {refusals}.")
-    good = [(error, c) for error, c in possible if error <= tolerance]
-    error, best = good[0] if good else min(possible, key=lambda pair: pair[0])
-    reasons = [
-        _verdict(best.model, error, tolerance, enough=bool(good)),
-        _describe_cooling(error_model),
-        _describe_contacts(error_model),
-        _describe_box(error_model),
-    ]
-    of_particles = (x for x in (best.model, *models) if isinstance(x, AbstractParticleModel))
-    noisy = next(of_particles, None)
-    if noisy is not None:
-        reasons.append(_describe_noise(error_model, noisy))
-    if "friction" in gas.elements:
-        reasons.append("These estimates leave friction out.")
-    for c in candidates:
-        if c.refusal is not None:
-            reasons.append(f"{_capitalised(c.model.name)}: {c.refusal.rstrip('.')}.")
-    return Choice(best.model, tuple(reasons), candidates, error)
+    model, error = _best(candidates, tolerance)
+    reasons = _verdict(model, error, tolerance), *_describe(error_model, model, candidates)
+    return Choice(model, reasons, candidates, error)
 
 
 def _candidate(model: AbstractModel, error_model: ErrorModel) -> Candidate:
@@ -167,9 +148,19 @@ def _candidate(model: AbstractModel, error_model: ErrorModel) -> Candidate:
     return Candidate(model, min(model.estimated_error(error_model), 1.0), None)
 
 
-def _verdict(model: AbstractModel, error: float, tolerance: float, enough: bool) -> str:
+def _best(candidates: Sequence[Candidate], tolerance: float) -> tuple[AbstractModel, float]:
+    """Return the fastest model within the tolerance, or the most accurate one, and its error."""
+    possible = [(c.model, c.error) for c in candidates if c.error is not None]
+    if not possible:
+        refusals = "; ".join(str(c.refusal).rstrip(".") for c in candidates)
+        raise ValueError(f"no model supports this scene: {refusals}.")
+    accurate = [(model, error) for model, error in possible if error <= tolerance]
+    return accurate[0] if accurate else min(possible, key=lambda pair: pair[1])
+
+
+def _verdict(model: AbstractModel, error: float, tolerance: float) -> str:
     name = _capitalised(model.name)
-    if enough:
+    if error <= tolerance:
         return (
             f"{name}: the fastest model whose estimated error of T, {_percent(error)}, is within "
             f"{_percent(tolerance)}."
@@ -181,6 +172,24 @@ def _verdict(model: AbstractModel, error: float, tolerance: float, enough: bool)
     if model.stochastic:
         verdict += " More particles or replicas reduce the noise."
     return verdict
+
+
+def _describe(
+    error_model: ErrorModel, chosen: AbstractModel, candidates: Sequence[Candidate]
+) -> Iterator[str]:
+    """Yield what the estimates say of the gas, and why models do not support it."""
+    yield _describe_cooling(error_model)
+    yield _describe_contacts(error_model)
+    yield _describe_box(error_model)
+    models = chosen, *(c.model for c in candidates)
+    of_particles = next((x for x in models if isinstance(x, AbstractParticleModel)), None)
+    if of_particles is not None:
+        yield _describe_noise(error_model, of_particles)
+    if "friction" in error_model.gas.elements:
+        yield "These estimates leave friction out."
+    for c in candidates:
+        if c.refusal is not None:
+            yield f"{_capitalised(c.model.name)}: {c.refusal.rstrip('.')}."
 
 
 def predict_error_model(gas: Gas, end: float, num_particles: int | None = None) -> ErrorModel:
