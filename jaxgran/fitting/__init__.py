@@ -12,7 +12,8 @@
 - `goodness`, `outliers`: tests of the fit, and far values.
 - `alternatives`: alternative explanations of a curve, and the range of the parameters over them;
   `kinds` is the table of them, `profiles` the fits with each.
-- `conclusions`, `messages`: what a fit concludes, and in which words; `report` shows them.
+- `conclusions`: what a fit concludes, in words: `headline` is its first line, `verdict` its grade,
+  `reasons` the reasons for it; `report` shows them.
 - `learnt_law`: eps(v) of a fitted law, with its band.
 - `plan`, `candidates`, `twins`: the range to expect of an experiment, additions to it, and curves
   by theory for what may be true.

@@ -22,13 +22,12 @@ from jaxgran.fitting.information import (
     undetermined,
     weights_of_measurements,
 )
-from jaxgran.fitting.messages import Message
 from jaxgran.fitting.outliers import without_outliers
 from jaxgran.fitting.parameters import as_floats, with_parameters
 from jaxgran.fitting.prediction import TINY
 from jaxgran.fitting.problem import Evaluation, Problem, unknown_of
 from jaxgran.fitting.profiles import ALLOWED
-from jaxgran.fitting.result import Fit
+from jaxgran.fitting.result import Fit, prefix_of
 from jaxgran.fitting.rows import SCATTER, WHITE, CurveRows, has_no_measured_errors
 from jaxgran.fitting.search import Minimum, deepest, minima_from_starts, minimise
 from jaxgran.fitting.setup import Request, build_problem, problem_with_rate_errors
@@ -88,13 +87,17 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
         noise = np.zeros(problem.num_free)
         explanations = compare_alternatives(end.problem, end.minima, noise)
     result = _result(request, end, explanations, quality)
-    notes: list[str | Message] = [*notes_on_data]
+    notes = [*notes_on_data]
     if distant:
-        notes.append(Message("distant", ratio=DISTANT_FACTOR))
+        notes.append(
+            "nearly every T differs from the fitted one by more than a factor of "
+            f"{DISTANT_FACTOR:g}: alternatives were not compared; check the units, the scale of T "
+            "and T0"
+        )
     elif result.p_value < SIGNIFICANCE and not request.quick:
         notes += _outlier_notes(plain.problem, first, max_steps)
     if found.scatter_of_eps is not None:
-        notes.append(Message("scatter of eps", scatter=found.scatter_of_eps))
+        notes.append(f"eps of the impacts scatters by {found.scatter_of_eps:.2g} beyond its errors")
     share = measurement_share(end.problem, found)
     return with_conclusions(request, result, explanations, notes, share)
 
@@ -222,7 +225,7 @@ def _distant_curves(problem: Problem, found: Evaluation) -> list[str]:
     return labels
 
 
-def _outlier_notes(problem: Problem, first: np.ndarray, max_steps: int) -> list[Message]:
+def _outlier_notes(problem: Problem, first: np.ndarray, max_steps: int) -> list[str]:
     """Return a clause on far outliers with the first parameter of a fit without them; [] if such a
     fit is no better."""
     rest, end, left_out = without_outliers(problem, first, max_steps)
@@ -232,17 +235,16 @@ def _outlier_notes(problem: Problem, first: np.ndarray, max_steps: int) -> list[
     times = {m.label: np.asarray(m.curve.times) for m in problem.curves}
     places = []
     for value in sorted(left_out):
-        prefix = f"{value.label}: " if value.label else ""
         time = times[value.label][value.time]
-        places.append(f"{prefix}t = {time:.3g} s (row {value.time + 1})")
-    message = Message(
-        "outliers",
-        places=", ".join(places),
-        symbol=symbol_of(problem.unknowns[0].name),
-        value=rest.estimates(end.flat)[0],
-        error=np.sqrt(inverse(found.information)[0, 0]) * rest.slopes(end.flat)[0],
+        places.append(f"{prefix_of(value.label)}t = {time:.3g} s (row {value.time + 1})")
+    symbol = symbol_of(problem.unknowns[0].name)
+    estimate = rest.estimates(end.flat)[0]
+    error = np.sqrt(inverse(found.information)[0, 0]) * rest.slopes(end.flat)[0]
+    note = (
+        f"far outliers at {', '.join(places)}: check them and their error bars; without them "
+        f"{symbol} is {estimate:.3g} +- {error:.2g}"
     )
-    return [message]
+    return [note]
 
 
 def _result(

@@ -14,13 +14,13 @@ from jaxgran._utils.validation import check_bool, checked_int
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.measurement import DENSITY, START_TIME, Measurement, Priors
-from jaxgran.fitting.conclusions import describe_search
 from jaxgran.fitting.descent import Descent, is_transformation
 from jaxgran.fitting.estimate import fit_without_noise
 from jaxgran.fitting.guesses import halving_time
 from jaxgran.fitting.learnt_law import describe_unvisited_knots
 from jaxgran.fitting.measured_rows import unused_displacements, unused_rotation
 from jaxgran.fitting.parameters import SHARED, SMOOTHNESS, domain_of, with_names_of_law
+from jaxgran.fitting.reasons import describe_search
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.setup import Request
 from jaxgran.fitting.simulated_fit import fit_through_simulations
@@ -467,7 +467,7 @@ def _check_priors(priors: dict[str, Priors], separate: tuple[str, ...]) -> None:
 def _warnings(result: Fit, model: AbstractModel) -> Iterator[str]:
     """Yield what a user should know before the result is used."""
     yield from describe_unvisited_knots(result)
-    yield from map(str, describe_search(result))
+    yield from describe_search(result)
     if jnp.result_type(float) == jnp.float32:
         yield (
             "fitting in float32: relative errors below 1e-4 are round-off. Call "

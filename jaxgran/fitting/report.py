@@ -1,7 +1,7 @@
 """The report of a fit as text: ranges, estimates, error budget, alternatives, reasons."""
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from jaxgran.data.header_keys import GUESS
 from jaxgran.data.measurement import Measurement
 from jaxgran.fitting.alternatives import Alternative
 from jaxgran.fitting.goodness import SIGNIFICANCE
-from jaxgran.fitting.result import CONDITIONAL, Fit
+from jaxgran.fitting.result import CONDITIONAL, Fit, prefix_of
 from jaxgran.scene.parameters import symbol_of, unit_of
 
 BUDGET_PARTS = {
@@ -26,41 +26,11 @@ BUDGET_PARTS = {
 }
 """Meaning of the parts of the error budget; other parts have the name of what is uncertain."""
 
-LINES = {
-    "drops": "drops    {name}{number} impacts, v = {low:.3g} .. {high:.3g} m/s",
-    "oblique": "         oblique, {low:.2g} .. {high:.2g} degrees from the normal",
-    "source": "         {source}",
-    "shared grains": "         they share grains with T(t), and hardly errors",
-    "curve": "curve    {name}{number} points, t = {first:.6g} .. {last:.6g} s,",
-    "T falls": "         T falls to {ratio:.3g} of its first value",
-    "gas": "gas      phi = {phi:.3g}, tau_c = {tau_c:.3g} s, t_c/tau_c = {contact_fraction:.2g} "
-    "(fitted)",
-    "viscoelastic gas": "gas      phi = {phi:.3g}, tau_c = {tau_c:.3g} s, t_c/tau_c = "
-    "{contact_fraction:.2g}, beta_T0 = {beta:.3g} (fitted)",
-    "impacts": "impacts  eps = {eps_first:.3g} at the thermal speed of t = 0, {eps_last:.3g} at "
-    "the last one;",
-    "free path": "         mean free path {path:.3g} mm",
-    "free path in box": "         mean free path {path:.3g} mm, in a box of {side:.3g} mm if it is "
-    "a {shape}",
-    "A and Y": "         short contacts depend on A Y^(2/5) only: 10 % in Y is 4 % in A",
-    "model": "model    {model}, {number} steps of the search",
-    "stochastic model": "model    {model}, {number} simulations",
-    "agree": "The measurements do not contradict each other (p = {p:.2g}).",
-    "contradict": "The measurements contradict each other, or the model (p = {p:.2g}).",
-    "reason": "  - {reason}",
-    "budget": "error of {symbol}: {parts}",
-    "budget table": "error of {symbol}, in {words}; the squares of the parts add up",
-    "budget row": "  {share:8.2g}  {name}: {meaning}",
-    "other part": "uncertainty of this input, as given or as known",
-}
-"""Lines of the report by name, with places for values."""
+OTHER_PART = "uncertainty of this input, as given or as known"
+"""Meaning of a part of the error budget that is not in `BUDGET_PARTS`."""
 
 SHAPES = {2: "square", 3: "cube"}
 """Shape of a box with equal sides, by its dimension."""
-
-
-def _line(name: str, /, **values: Any) -> str:
-    return LINES[name].format(**values)
 
 
 class ParameterRow(NamedTuple):
@@ -120,8 +90,8 @@ def report(result: Fit, *, explain: bool = False) -> str:
         else:
             lines += _curve(label, measurement)
             lines += _gas(measurement, result.scales[label])
-    kind = "stochastic model" if "simulation" in result.covariances else "model"
-    lines.append(_line(kind, model=result.model_name, number=result.iterations))
+    steps = "simulations" if "simulation" in result.covariances else "steps of the search"
+    lines.append(f"model    {result.model_name}, {result.iterations} {steps}")
     lines += ["", *_parameters(rows)]
     for row in rows:
         if not np.isnan(row.estimate):
@@ -130,9 +100,11 @@ def report(result: Fit, *, explain: bool = False) -> str:
     if alternatives.rows:
         lines += ["", *table(*alternatives)]
     if len(result.measurements) > 1:
-        agreement = "contradict" if result.p_value < SIGNIFICANCE else "agree"
-        lines += ["", _line(agreement, p=result.p_value)]
-    lines += ["", *(_line("reason", reason=reason) for reason in result.reasons)]
+        agreement = "The measurements do not contradict each other"
+        if result.p_value < SIGNIFICANCE:
+            agreement = "The measurements contradict each other, or the model"
+        lines += ["", f"{agreement} (p = {result.p_value:.2g})."]
+    lines += ["", *(f"  - {reason}" for reason in result.reasons)]
     return "\n".join(lines)
 
 
@@ -203,44 +175,46 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
 
 def _drop_test(label: str, measurement: Measurement, data: DropTest) -> Iterator[str]:
     v = np.asarray(data.speed)
-    yield _line("drops", name=_name(label), number=v.size, low=v.min(), high=v.max())
+    yield (f"drops    {prefix_of(label)}{v.size} impacts, v = {v.min():.3g} .. {v.max():.3g} m/s")
     if data.is_oblique:
         tilt = np.degrees(np.arctan2(np.asarray(data.tangential_speed), v))
-        yield _line("oblique", low=tilt.min(), high=tilt.max())
+        yield f"         oblique, {tilt.min():.2g} .. {tilt.max():.2g} degrees from the normal"
     header = dict(measurement.header)
     if "impacts_from" in header:
-        yield _line("source", source=header["impacts_from"])
-        yield _line("shared grains")
-
-
-def _name(label: str) -> str:
-    return f"{label}: " if label else ""
+        yield f"         {header['impacts_from']}"
+        yield "         they share grains with T(t), and hardly errors"
 
 
 def _curve(label: str, measurement: Measurement) -> Iterator[str]:
     T = np.asarray(measurement.curve.temperature)
     times = np.asarray(measurement.curve.times)
-    yield _line("curve", name=_name(label), number=T.size, first=times[0], last=times[-1])
+    yield (f"curve    {prefix_of(label)}{T.size} points, t = {times[0]:.6g} .. {times[-1]:.6g} s,")
     coolest = T[above_noise(measurement.curve)][-1]
-    yield _line("T falls", ratio=coolest / T[0])
+    yield f"         T falls to {coolest / T[0]:.3g} of its first value"
     header = dict(measurement.header)
     if "T_from" in header:
-        yield _line("source", source=header["T_from"])
+        yield f"         {header['T_from']}"
 
 
 def _gas(measurement: Measurement, scales: dict[str, float]) -> Iterator[str]:
     """Yield lines on a fitted gas, given the numbers that describe it (`Fit.scales`)."""
-    is_viscoelastic = "beta" in scales
-    yield _line("viscoelastic gas" if is_viscoelastic else "gas", **scales)
-    yield _line("impacts", **scales)
-    path = 1e3 * scales["mean_free_path"]
+    beta = f", beta_T0 = {scales['beta']:.3g}" if "beta" in scales else ""
+    yield (
+        f"gas      phi = {scales['phi']:.3g}, tau_c = {scales['tau_c']:.3g} s, "
+        f"t_c/tau_c = {scales['contact_fraction']:.2g}{beta} (fitted)"
+    )
+    yield (
+        f"impacts  eps = {scales['eps_first']:.3g} at the thermal speed of t = 0, "
+        f"{scales['eps_last']:.3g} at the last one;"
+    )
+    path = f"         mean free path {1e3 * scales['mean_free_path']:.3g} mm"
     if measurement.num_particles is None:
-        yield _line("free path", path=path)
+        yield path
     else:
         shape = SHAPES[measurement.gas.dimension]
-        yield _line("free path in box", path=path, side=1e3 * scales["side"], shape=shape)
-    if is_viscoelastic:
-        yield _line("A and Y")
+        yield f"{path}, in a box of {1e3 * scales['side']:.3g} mm if it is a {shape}"
+    if beta:
+        yield "         short contacts depend on A Y^(2/5) only: 10 % in Y is 4 % in A"
 
 
 def _parameters(rows: list[ParameterRow]) -> Iterator[str]:
@@ -285,14 +259,13 @@ def _shares(row: ParameterRow) -> list[tuple[str, float]]:
 def _budget(row: ParameterRow) -> str:
     unit = "ms" if _is_time(row) else "%"
     parts = [f"{name} {share:.2g} {unit}" for name, share in _shares(row)]
-    return _line("budget", symbol=row.parameter, parts=", ".join(parts))
+    return f"error of {row.parameter}: {', '.join(parts)}"
 
 
 def _budget_table(row: ParameterRow) -> Iterator[str]:
     """Yield the parts of an error, each with its meaning."""
     words = "ms" if _is_time(row) else "per cent"
     yield ""
-    yield _line("budget table", symbol=row.parameter, words=words)
+    yield f"error of {row.parameter}, in {words}; the squares of the parts add up"
     for name, share in _shares(row):
-        meaning = BUDGET_PARTS.get(name, LINES["other part"])
-        yield _line("budget row", share=share, name=name, meaning=meaning)
+        yield f"  {share:8.2g}  {name}: {BUDGET_PARTS.get(name, OTHER_PART)}"

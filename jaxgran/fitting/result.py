@@ -263,3 +263,8 @@ class Fit:
 def by_label(of_fit: Any) -> dict[str, Any]:
     """Return `Fit.gas` or `Fit.curve` as a dictionary, in which a single one has the label ""."""
     return of_fit if isinstance(of_fit, dict) else {"": of_fit}
+
+
+def prefix_of(label: str) -> str:
+    """Return what stands before a sentence on a measurement; nothing without a label."""
+    return f"{label}: " if label else ""

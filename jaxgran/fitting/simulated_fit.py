@@ -17,7 +17,6 @@ from jaxgran.fitting.estimate import describe_gas, fit_without_noise, parameter_
 from jaxgran.fitting.goodness import goodness
 from jaxgran.fitting.information import undetermined
 from jaxgran.fitting.measured_rows import curve_rows, with_rate_error
-from jaxgran.fitting.messages import Message
 from jaxgran.fitting.parameters import as_floats, with_parameters
 from jaxgran.fitting.prediction import predicted_curve
 from jaxgran.fitting.problem import Problem, summed
@@ -135,7 +134,7 @@ def _result(
     of_theory: Request,
     sims: Simulations,
     search: Search,
-    notes: Sequence[str | Message],
+    notes: Sequence[str],
 ) -> Fit:
     """Return the result of a search through simulations."""
     problem = sims.problem
@@ -159,7 +158,12 @@ def _result(
         else:
             notes = [*notes, NOT_COMPARED]
     if bias >= MIN_REPORTED_BIAS:
-        notes = [*notes, Message("slopes", share=100 * bias)]
+        note = (
+            "the error of the derivatives through particles is estimated as "
+            f"{100 * bias:.2g} %, which the standard error includes: use more replicas or, if the "
+            "gas has a flow, differences=0.3 (in Python)"
+        )
+        notes = [*notes, note]
     rows = _residuals(search, expansion)
     found = summed([rows], {})
     scatter_error = (2 / expansion.degrees_of_freedom) ** 0.5
