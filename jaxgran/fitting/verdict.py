@@ -75,7 +75,7 @@ def _rising(result: Fit) -> list[tuple[float, float]]:
         T = np.asarray(m.data.temperature)
         trend = scipy.stats.kendalltau(np.arange(T.size), T, alternative="greater")
         if m.data.temperature_error is None and trend.pvalue < RISING_SIGNIFICANCE:
-            found.append((T[0], T[-1]))
+            found.append((float(T[0]), float(T[-1])))
     return found
 
 

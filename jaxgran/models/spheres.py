@@ -105,7 +105,7 @@ class AbstractSpheres(AbstractParticleModel):
             )
 
     def check_spheres(self, gas: Gas, min_wall_distance: float) -> None:
-        """Check the start, the derivatives and the box of a gas.
+        """Raise ValueError for a start, derivatives or a box that spheres do not support.
 
         Args:
             gas: the gas.

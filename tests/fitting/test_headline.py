@@ -1,17 +1,10 @@
 """The first line of a fit."""
 
-from types import SimpleNamespace
+import pytest
 
-import numpy as np
-
-from jaxgran.fitting.headline import headline
+from jaxgran.fitting.headline import unit_after_number
 
 
-def test_a_parameter_without_a_unit_has_no_blank_before_a_comma():
-    fit = SimpleNamespace(
-        names=("restitution",),
-        value=lambda name: (0.9, 0.02),
-        ranges={"restitution": (np.array([0.85]), np.array([0.95]))},
-        alternatives=(),
-    )
-    assert headline(fit) == "eps = 0.9, 95 % range 0.85 to 0.95"
+@pytest.mark.parametrize("name, unit", [("restitution", ""), ("dense: temperature", " m^2/s^2")])
+def test_a_blank_stands_between_a_number_and_its_unit(name, unit):
+    assert unit_after_number(name) == unit

@@ -1,4 +1,4 @@
-"""Hard and soft spheres alike: they cool as kinetic theory says, melt and keep to their plan."""
+"""Hard and soft spheres alike: they cool as kinetic theory says, and melt."""
 
 import dataclasses
 
