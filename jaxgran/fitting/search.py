@@ -85,6 +85,24 @@ class Minimum(NamedTuple):
     trace: Trace | None = None
 
 
+class Solution(NamedTuple):
+    """Where the searches of a problem end.
+
+    Attributes:
+        problem: of a fit.
+        best: the deepest minimum.
+        minima: all minima.
+    """
+
+    problem: Problem
+    best: Minimum
+    minima: list[Minimum]
+
+    def evaluate(self) -> Evaluation:
+        """Return -2 ln L at the deepest minimum."""
+        return self.problem.evaluate(self.best.flat)
+
+
 Minimiser = Callable[[Problem, np.ndarray, int], Minimum]
 """A search of a problem from a first guess, with a maximum number of steps."""
 
