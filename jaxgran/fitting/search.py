@@ -21,7 +21,7 @@ CONVERGED_STEP = 0.03
 
 STALLED_STEP = 0.3
 """A search that has stalled has converged if the next Newton step is shorter than this, in standard
-errors. It stalls at a kink of -2 ln L, where a measured point passes t0."""
+errors. It stalls at a kink of -2 ln L, where a measured point passes t0, or by a learning rate."""
 
 MAX_STALLED = 6
 """A search has stalled after this number of successive steps that hardly lower -2 ln L."""

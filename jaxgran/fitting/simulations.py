@@ -345,7 +345,8 @@ def by_descent(
         return jnp.sum(residuals**2) + jnp.sum(prior**2)
 
     def at(flat: np.ndarray, step: int) -> Loss:
-        return Loss(*jax.value_and_grad(loss)(jnp.asarray(flat), step))
+        value, gradient = jax.value_and_grad(loss)(jnp.asarray(flat), step)
+        return Loss(float(value), gradient)
 
     used = int(np.sum(sims.rows.used))
     course = descent.descend(at, first, max_simulations, used, sims.problem.estimates, noisy=True)
