@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxgran.data.header_elements import elements_of_header, header_sides
+from jaxgran.data.header_elements import elements_of_header
 from jaxgran.data.header_keys import (
     GUESS,
     OPTIONAL_KEYS,
@@ -15,7 +15,7 @@ from jaxgran.data.header_keys import (
     UNSUPPORTED_KEYS,
     VISCOELASTIC_KEYS,
 )
-from jaxgran.data.header_values import header_dimension, header_number
+from jaxgran.data.header_values import header_dimension, header_number, header_sides
 from jaxgran.data.questions import ask
 from jaxgran.data.units import UNIT_KEYS
 from jaxgran.data.usual_values import ask_about_header

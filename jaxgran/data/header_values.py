@@ -56,3 +56,12 @@ def header_count(header: Mapping[str, Any], key: str) -> int | None:
 def header_dimension(header: Mapping[str, Any]) -> int:
     """Return the dimension of the gas, 3 unless the header gives another one."""
     return header_count(header, "dimension") or 3
+
+
+def header_sides(header: Mapping[str, Any]) -> float | list[float]:
+    """Return the side of a cubic or square container, or its d sides, m."""
+    sides = [
+        header_number({"container_side": part.strip()}, "container_side")
+        for part in str(header["container_side"]).split("x")
+    ]
+    return sides if len(sides) > 1 else sides[0]

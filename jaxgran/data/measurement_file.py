@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxgran.data import files
-from jaxgran.data.curve_file import CSV_FILE, read_data
+from jaxgran.data.curve_file import CSV_FILE, Content, read_data
 from jaxgran.data.drop_test import DropTest
 from jaxgran.data.header import (
     ask_about_another_gas,
@@ -35,29 +35,31 @@ def read_measurement(
         0.0,1.0e-2,0,0
         7.8e-3,9.79e-3,8.0e-6,1.7e-6
 
+    A curve has the columns t (s) and T (m^2/s^2) and, where measured, T_err (m^2/s^2), T_rot,
+    T_rot_err, msd and msd_err (m^2), in any order. In place of T there may be mean_speed, vx2,
+    v2_xy or energy (`jaxgran.data.curve_file.TEMPERATURE_COLUMNS`), with errors under the same name
+    and _err. A drop test has the columns v (m/s), eps and eps_err; oblique impacts have v_n,v_t (or
+    v,angle), eps, eps_err, eps_t and eps_t_err, or velocities and spins
+    (`jaxgran.data.drop_test_file.drop_test_of_table`). Tracks of particles have the columns
+    id,t,x,y and, where measured, z (`jaxgran.data.tracks.curve_of_tracks`).
+
+    Units may stand after a name or a value, as in ``t (ms)`` and ``# diameter: 2 mm``. The header
+    keys length_unit, time_unit and speed_unit, which holds for T squared, give units of all other
+    columns and of diameter, T0, A and the like; other numbers are in SI. Commas, semicolons, tabs
+    or blanks separate the columns; between semicolons numbers may have decimal commas.
+
+    The keys of a header are those of the gas (`jaxgran.data.header.gas_of_header`), of errors
+    (`jaxgran.data.measurement_header.priors_of_header`), of drop tests, onto ("sphere", "plate" or
+    "wall"), eps_scatters ("yes") and spin_before ("0"), and of tracks. N, replicas, absent,
+    tracked, T0_of ("run" or "ensemble"), T_scale_err and errors ("measured") stand for the
+    arguments of `Measurement`; T_scale is a factor that T already contains, with its error behind
+    it.
+
     Args:
-        path: the file. A CSV file of a curve has the columns t (s) and T (m^2/s^2) and, where
-            measured, T_err (m^2/s^2), T_rot, T_rot_err, msd and msd_err (m^2), in any order. In
-            place of T there may be mean_speed, vx2, v2_xy or energy
-            (`jaxgran.data.curve_file.TEMPERATURE_COLUMNS`), with errors under the same name and
-            _err. A drop test has the columns v (m/s), eps and eps_err; oblique impacts have
-            v_n,v_t (or v,angle), eps, eps_err, eps_t and eps_t_err, or velocities and spins
-            (`jaxgran.data.drop_test_file.drop_test_of_table`). Tracks of particles have the columns
-            id,t,x,y and, where measured, z (`jaxgran.data.tracks.curve_of_tracks`).
-            Units may stand after a name or a value, as in ``t (ms)`` and ``# diameter: 2 mm``;
-            header keys length_unit, time_unit and speed_unit, which holds for T squared, give
-            units of all other columns and of diameter, T0, A and the like; other numbers are in
-            SI. Commas, semicolons, tabs or blanks separate the columns; between semicolons
-            numbers may have decimal commas.
-            Trajectories with velocities (GSD, extended XYZ, LAMMPS dump) and npz files that
-            `write_curve` writes are read, too.
-        header: further entries of the header, before anything is read; they replace
-            entries with the same key. Keys: see `jaxgran.data.header.gas_of_header` and
-            `jaxgran.data.measurement_header.priors_of_header`, N, replicas, absent, tracked,
-            T0_of ("run" or "ensemble"), T_scale_err, errors ("measured"), which stand for the
-            arguments of `Measurement`, T_scale, a factor that T already contains, with its error
-            behind it, those of drop tests, onto ("sphere", "plate" or "wall"),
-            eps_scatters ("yes") and spin_before ("0"), and the keys of tracks.
+        path: the file: a CSV file, a trajectory with velocities (GSD, extended XYZ, LAMMPS dump),
+            or an npz file that `write_curve` writes.
+        header: further entries of the header, before anything is read; they replace entries with
+            the same key.
         gas: the gas in place of the header's, such as the gas of a curve for a drop test.
 
     Returns:
@@ -74,25 +76,28 @@ def read_measurement(
     ((4,), 250)
     """
     path = files.checked_path(path, CSV_FILE)
-    given = {} if header is None else checked_header(header)
+    entries = {} if header is None else checked_header(header)
     with files.name_in_errors(path):
-        content = read_data(path, given)
-        entries = content.header
-        if gas is not None:
-            questions = ask_about_another_gas(entries, gas)
-        elif isinstance(content.data, DropTest):
-            gas, questions = _gas_of_drop_test(entries)
-        else:
-            gas, questions = gas_of_header(entries)
-        arguments = arguments_of_header(entries)
+        content = read_data(path, entries)
+        gas, questions = _gas_of(content, gas)
+        arguments = arguments_of_header(content.header)
         measurement = Measurement(gas, content.data, rounding=content.rounding, **arguments)
     for question in (*content.questions, *questions):
         warnings.warn(f"{path}: {question}", stacklevel=2)
     return measurement
 
 
+def _gas_of(content: Content, gas: Gas | None) -> tuple[Gas, list[str]]:
+    """Return a given gas, or else the gas of the header, and questions about it."""
+    if gas is not None:
+        return gas, ask_about_another_gas(content.header, gas)
+    if isinstance(content.data, DropTest):
+        return _gas_of_drop_test(content.header)
+    return gas_of_header(content.header)
+
+
 def _gas_of_drop_test(header: dict[str, str]) -> tuple[Gas, list[str]]:
-    """Return the gas of a drop test, and questions about its header."""
+    """Return the gas of a drop test, and questions about it."""
     unused = dict(UNUSED_BY_IMPACTS)
     if {"N", "container_side"} <= header.keys():
         del unused["eta"]  # which these two give

@@ -4,11 +4,13 @@
 - `setup`: what a user asks for, as a `problem` with a first guess (`guesses`): `rows` are the
   measured values, which `measured_rows` makes of a measurement, `parameters` the unknowns on an
   unconstrained scale, `priors` what is known of them.
-- `prediction`, `comparison`, `innovations`: a curve by a model with its derivatives, and its
-  independent residuals; `likelihood`: the public function of the gas.
+- `prediction`, `comparison`: a curve by a model with its derivatives, and its independent
+  residuals, the `innovations` by a Kalman filter (`kalman`); `likelihood`: the public function of
+  the gas.
 - `search`: the maximum of the likelihood; `simulations`: the same for stochastic models,
   `simulated_errors` the errors of its estimate, and `simulated_fit` its result.
-- `estimate`, `result`: the estimate with its errors by cause (`information`), and `Fit`.
+- `estimate`: the searches of a fit and the tests of what they found; `assemble`: its numbers, with
+  errors by cause (`information`); `result`: the class `Fit`.
 - `goodness`, `outliers`: tests of the fit, and far values.
 - `alternatives`: alternative explanations of a curve, and the range of the parameters over them;
   `kinds` is the table of them, `profiles` the fits with each.

@@ -192,7 +192,7 @@ def _fit_minima(problem: Problem, minima: list[Minimum]) -> list[Trial]:
 def _significant_fall(problem: Problem, base: Trial, num_kinds: int) -> float:
     """Return the decrease of -2 ln L from which an explanation excludes others."""
     found = problem.evaluate(base.flat)
-    if goodness(problem, found)["smooth_p_value"] < SIGNIFICANCE:
+    if goodness(problem, found).smooth_p_value < SIGNIFICANCE:
         return np.inf  # such a curve prefers whatever has less noise
     return float(scipy.stats.chi2.isf(PREFERENCE_LEVEL / max(num_kinds, 1), 1))
 

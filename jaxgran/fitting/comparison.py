@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxgran._utils.tracing import fast_jit
-from jaxgran.fitting.innovations import Innovations, Nodes, filtered, innovations
+from jaxgran.fitting.innovations import Innovations, innovations
+from jaxgran.fitting.kalman import Nodes, filtered
 from jaxgran.fitting.parameters import with_parameters
 from jaxgran.fitting.prediction import Element, PredictedCurve, Prediction, diffusive_share
 from jaxgran.fitting.rows import DISPLACEMENT, Displacement, Noise, Observed
@@ -197,7 +198,6 @@ class Comparison:
 def _nodes(curve: PredictedCurve, batch: Prediction, gas: Gas) -> Nodes:
     """Return predictions of some gases, which are the last axis of `batch`, as nodes."""
     return Nodes(
-        times=curve.times,
         log_temperature=batch.log_T,
         rotation=batch.rotation,
         sonine=curve.sonine,

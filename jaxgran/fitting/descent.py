@@ -16,7 +16,14 @@ from jaxtyping import Float
 from tqdm import tqdm
 
 from jaxgran.fitting.problem import Problem
-from jaxgran.fitting.search import LAST_STEP, Minimum, Objective, Trace, newton_step
+from jaxgran.fitting.search import (
+    LAST_STEP,
+    STALLED_STEP,
+    Minimum,
+    Objective,
+    Trace,
+    newton_step,
+)
 
 MAX_GROWTH = 10.0
 """A descent diverges where -2 ln L exceeds its first value by this number for each residual, and
@@ -39,12 +46,12 @@ class Loss(NamedTuple):
     Attributes:
         value: -2 ln L.
         gradient: its derivatives.
-        at_minimum: whether the next Newton step is short.
+        newton_length: length of the next Newton step, in standard errors; inf if not known.
     """
 
-    value: Any
+    value: float
     gradient: Any
-    at_minimum: bool = False
+    newton_length: float = np.inf
 
 
 class Course(NamedTuple):
@@ -87,7 +94,7 @@ class Descent:
             found = objective.evaluate(flat)
             if not found.is_finite:
                 return Loss(np.inf, np.zeros_like(flat))
-            return Loss(found.value, found.gradient, newton_step(found).length < LAST_STEP)
+            return Loss(found.value, found.gradient, newton_step(found).length)
 
         size = sum(row.values.size for row in problem.evaluate(first).rows)
         course = self.descend(loss, first, max_steps, size, problem.estimates, noisy=False)
@@ -127,18 +134,18 @@ class Descent:
         update = self._compiled_update()
         flat = jnp.asarray(first)
         state = self._transformation.init(flat)
-        losses: list[float] = []
+        losses: list[Loss] = []
         flats = []
         ending = None
         hidden = None if self.progress else True  # None hides the bar where there is no terminal
         with tqdm(total=max_steps, disable=hidden, desc="fit", unit="step") as bar:
             for step in range(max_steps):
                 loss = loss_at(np.asarray(flat), step)
-                losses.append(float(loss.value))
+                losses.append(loss)
                 flats.append(np.asarray(flat))
                 bar.update()
-                bar.set_postfix_str(f"-2 ln L {losses[-1]:.4g}")
-                ending = _ending(losses, loss, size, noisy)
+                bar.set_postfix_str(f"-2 ln L {loss.value:.4g}")
+                ending = _ending(losses, size, noisy)
                 if ending is not None:
                     break
                 changes, state = update(
@@ -149,12 +156,13 @@ class Descent:
             ending = _Ending(f"the largest number of steps, {max_steps}, was reached")
         if ending.diverged and self.throw:
             raise RuntimeError(f"{ending.reason}; throw=False returns the best step so far")
+        values = np.array([loss.value for loss in losses])
         return Course(
             flats=np.stack(flats),
-            losses=np.where(np.isnan(losses), np.inf, losses),
+            losses=np.where(np.isnan(values), np.inf, values),
             converged=ending.converged,
             diverged=ending.diverged,
-            trace=Trace(np.asarray(losses), np.stack([estimates(x) for x in flats]), ending.reason),
+            trace=Trace(values, np.stack([estimates(x) for x in flats]), ending.reason),
         )
 
     @cached_property
@@ -204,49 +212,64 @@ class _Ending(NamedTuple):
     diverged: bool = False
 
 
-def _ending(losses: list[float], loss: Loss, size: int, noisy: bool) -> _Ending | None:
+def _ending(losses: list[Loss], size: int, noisy: bool) -> _Ending | None:
     """Return why a descent ends with its last step; None if it continues.
 
     Args:
-        losses: -2 ln L at all steps.
-        loss: at the last step.
+        losses: at all steps.
         size: number of residuals.
         noisy: whether the loss has noise.
     """
-    last = losses[-1]
+    values = [loss.value for loss in losses]
+    first = values[0]
+    last = values[-1]
     if not np.isfinite(last):
-        return _divergence(losses, "not finite")
-    if not np.all(np.isfinite(loss.gradient)):
-        return _divergence(losses, "where its gradient is not finite")
-    if last > losses[0] + MAX_GROWTH * size and last > 2 * losses[0]:
-        return _divergence(losses, f"{losses[0]:.3g} at first")
-    if loss.at_minimum:
+        return _divergence(values, "not finite")
+    if not np.all(np.isfinite(losses[-1].gradient)):
+        return _divergence(values, "where its gradient is not finite")
+    if last > first + MAX_GROWTH * size and last > 2 * first:
+        return _divergence(values, f"{first:.3g} at first")
+    if losses[-1].newton_length < LAST_STEP:
         reason = f"the next Newton step is below {LAST_STEP:g} standard errors"
         return _Ending(reason, converged=True)
-    if noisy and _falls_less_than_noise(losses):
+    if noisy and _falls_less_than_noise(values):
         return _Ending(f"-2 ln L no longer falls, in {WINDOW} steps", converged=True)
-    if not noisy and _hardly_falls(losses):
-        return _Ending(f"-2 ln L no longer falls, in {PATIENCE} steps", converged=True)
+    if not noisy and _hardly_falls(values):
+        return _flat_end(min(losses, key=lambda loss: loss.value))
     return None
 
 
-def _divergence(losses: list[float], detail: str) -> _Ending:
+def _flat_end(best: Loss) -> _Ending:
+    """Return whether a descent without noise that hardly falls is at a minimum.
+
+    By a small learning rate it hardly falls anywhere.
+    """
+    reason = f"-2 ln L no longer falls, in {PATIENCE} steps"
+    if best.newton_length < STALLED_STEP:
+        return _Ending(reason, converged=True)
+    return _Ending(
+        f"{reason}, but the next Newton step is {best.newton_length:.2g} standard errors. Change "
+        "the learning rate"
+    )
+
+
+def _divergence(values: list[float], detail: str) -> _Ending:
     reason = (
-        f"the descent diverges: -2 ln L is {losses[-1]:.3g} at step {len(losses) - 1}, {detail}."
+        f"the descent diverges: -2 ln L is {values[-1]:.3g} at step {len(values) - 1}, {detail}."
         " Lower the learning rate, or limit the gradient, as in optax.chain("
         "optax.clip_by_global_norm(1.0), optax.sgd(0.1))"
     )
     return _Ending(reason, diverged=True)
 
 
-def _hardly_falls(losses: list[float]) -> bool:
-    return len(losses) > PATIENCE and min(losses[:-PATIENCE]) - min(losses) < MIN_FALL
+def _hardly_falls(values: list[float]) -> bool:
+    return len(values) > PATIENCE and min(values[:-PATIENCE]) - min(values) < MIN_FALL
 
 
-def _falls_less_than_noise(losses: list[float]) -> bool:
-    if len(losses) < 2 * WINDOW:
+def _falls_less_than_noise(values: list[float]) -> bool:
+    if len(values) < 2 * WINDOW:
         return False
-    before, last = np.split(np.asarray(losses[-2 * WINDOW :]), 2)
+    before, last = np.split(np.asarray(values[-2 * WINDOW :]), 2)
     # The noise is taken from differences, which a trend does not widen.
-    noise = np.std(np.diff(losses[-2 * WINDOW :])) / WINDOW**0.5
+    noise = np.std(np.diff(values[-2 * WINDOW :])) / WINDOW**0.5
     return bool(abs(before.mean() - last.mean()) < noise)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.measurement import DENSITY, START_TIME, Measurement, Priors, prior_domain
-from jaxgran.fitting.innovations import SAMPLE_MEMORY
+from jaxgran.fitting.kalman import SAMPLE_MEMORY
 from jaxgran.fitting.measured_rows import sampling_variance
 from jaxgran.fitting.result import Fit
 

@@ -1,6 +1,6 @@
 """Whether a fitted model explains the data."""
 
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -13,7 +13,16 @@ SIGNIFICANCE = 0.005
 """Level of significance of the test of the misfit, on each side."""
 
 
-def goodness(problem: Problem, found: Evaluation) -> dict[str, Any]:
+class Goodness(NamedTuple):
+    """The test of a fit: see the fields of `jaxgran.fitting.result.Fit` with these names."""
+
+    chi2: float
+    degrees_of_freedom: int
+    p_value: float
+    smooth_p_value: float
+
+
+def goodness(problem: Problem, found: Evaluation) -> Goodness:
     """Return chi^2, its degrees of freedom, and its probabilities by chance.
 
     T and T_rot, <dr^2> and each drop test are tested separately, so that many points of one do not
@@ -45,12 +54,7 @@ def goodness(problem: Problem, found: Evaluation) -> dict[str, Any]:
             return 1.0
         return float(-np.expm1(len(values) * np.log1p(-min(min(values), 1 - 1e-12))))
 
-    return {
-        "chi2": chi2,
-        "degrees_of_freedom": degrees,
-        "p_value": corrected_p_value(upper),
-        "smooth_p_value": corrected_p_value(lower),
-    }
+    return Goodness(chi2, degrees, corrected_p_value(upper), corrected_p_value(lower))
 
 
 def _count(problem: Problem, row: Residuals) -> int:

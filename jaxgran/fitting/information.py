@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from jaxgran.fitting.comparison import Residuals
 from jaxgran.fitting.problem import Evaluation, Problem
 from jaxgran.fitting.rows import SCATTER
-from jaxgran.fitting.search import Minimum
+from jaxgran.fitting.search import Minimum, Solution
 from jaxgran.scene.laws import RestitutionLaw
 from jaxgran.scene.parameter_fields import law_fields
 
@@ -43,21 +43,16 @@ def inverse(information: np.ndarray) -> np.ndarray:
     return axes / np.maximum(values, MIN_EIGENVALUE) @ axes.T
 
 
-def information_by_source(
-    problem: Problem, flat: np.ndarray, found: Evaluation
-) -> dict[str, np.ndarray]:
+def information_by_source(solution: Solution) -> dict[str, np.ndarray]:
     """Return the information on all unknowns, as the variance of the estimate's score by source.
 
     A variance that grows by a share a lowers the information by a times its part.
-
-    Args:
-        problem: of a fit.
-        flat: the estimate, in the unconstrained scale.
-        found: -2 ln L there.
     """
+    problem = solution.problem
+    found = solution.evaluate()
     parts: defaultdict[str, np.ndarray] = defaultdict(lambda: np.zeros_like(found.information))
     for source in _sources_of_curves(problem):
-        with_variance = partial(_information_of_curves, problem, flat, source)
+        with_variance = partial(_information_of_curves, problem, solution.best.flat, source)
         parts[source] += decrease_with_variance(with_variance)
     for row in found.rows:
         # What the scatter itself tells is as uncertain as few grains make it.
@@ -112,45 +107,41 @@ def positive(matrix: np.ndarray) -> np.ndarray:
     return axes * np.maximum(values, 0.0) @ axes.T
 
 
-def covariance_of_minima(
-    problem: Problem, end: Minimum, minima: list[Minimum], covariance: np.ndarray
-) -> np.ndarray:
+def covariance_of_minima(solution: Solution, covariance: np.ndarray) -> np.ndarray:
     """Return the covariance of the estimates by minima that are nearly as deep, SI.
 
     Args:
-        problem: of a fit.
-        end: the deepest minimum.
-        minima: all minima.
+        solution: of a fit.
         covariance: of all unknowns, in their unconstrained scale.
     """
+    problem, best, minima = solution
     error = _errors_of_free(problem, covariance)
-    kept = [end]
+    kept = [best]
     for m in sorted(minima, key=lambda minimum: minimum.value):
         if min(_distance(m, other, error) for other in kept) > 1:
             kept.append(m)
-    distance = np.stack([problem.estimates(m.flat) - problem.estimates(end.flat) for m in kept])
-    weights = np.exp([(end.value - m.value) / 2 for m in kept])
+    distance = np.stack([problem.estimates(m.flat) - problem.estimates(best.flat) for m in kept])
+    weights = np.exp([(best.value - m.value) / 2 for m in kept])
     return np.einsum("k,ki,kj->ij", weights / np.sum(weights), distance, distance)
 
 
-def equally_good_minima(
-    problem: Problem, end: Minimum, minima: list[Minimum], covariance: np.ndarray
-) -> np.ndarray:
+def equally_good_minima(solution: Solution, covariance: np.ndarray) -> np.ndarray:
     """Return the estimates at other minima that are as good, three standard errors or more apart.
 
     Args:
-        problem, end, minima, covariance: see `covariance_of_minima`.
+        solution, covariance: see `covariance_of_minima`.
     """
+    problem, best, minima = solution
     error = _errors_of_free(problem, covariance)
-    solutions: list[np.ndarray] = []
+    estimates: list[np.ndarray] = []
     for m in minima:
-        is_deep = m.value < end.value + DEGENERATE
-        is_apart = _distance(m, end, error) > DEGENERATE**0.5
+        is_deep = m.value < best.value + DEGENERATE
+        is_apart = _distance(m, best, error) > DEGENERATE**0.5
         estimate = problem.estimates(m.flat)
-        is_known = any(np.allclose(estimate, other, rtol=1e-3) for other in solutions)
+        is_known = any(np.allclose(estimate, other, rtol=1e-3) for other in estimates)
         if is_deep and is_apart and not is_known:
-            solutions.append(estimate)
-    return np.array(solutions).reshape(-1, problem.num_free)
+            estimates.append(estimate)
+    return np.array(estimates).reshape(-1, problem.num_free)
 
 
 def _errors_of_free(problem: Problem, covariance: np.ndarray) -> np.ndarray:

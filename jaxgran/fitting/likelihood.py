@@ -22,13 +22,8 @@ from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.measurement import START_TIME, Measurement
 from jaxgran.data.run_options import Run
 from jaxgran.fitting.guesses import guess_from_data
-from jaxgran.fitting.innovations import (
-    Filtered,
-    Nodes,
-    filtered,
-    log_density_change,
-    log_ratio,
-)
+from jaxgran.fitting.innovations import log_density_change, log_ratio
+from jaxgran.fitting.kalman import Filtered, Nodes, filtered
 from jaxgran.fitting.measured_rows import curve_rows, with_rate_error
 from jaxgran.fitting.prediction import COMMON_FACTORS, diffusive_share, maxwellian_collisions
 from jaxgran.fitting.rows import CurveRows, Observed
@@ -150,7 +145,6 @@ def _nodes(gas: Gas, times: np.ndarray, computed: CoolingCurve, of_energy: bool)
         size_ratio = jnp.log(computed.size_ratio)
         by_size_ratio = energy_slope(gas.size_spread, size_ratio) if of_energy else nothing
     return Nodes(
-        times=jnp.asarray(times),
         log_temperature=jnp.log(computed.temperature),
         rotation=nothing if T_rot is None else T_rot / computed.temperature,
         sonine=nothing if computed.sonine is None else computed.sonine,
@@ -222,7 +216,7 @@ def _filtered_for_each_N(
         return jnp.broadcast_to(x[..., None], (*x.shape, steps.size))
 
     each = jax.tree.map(with_axis_of_N, nodes)
-    each = each._replace(times=nodes.times, sonine=nodes.sonine)  # the same for all gases: `Nodes`
+    each = each._replace(sonine=nodes.sonine)  # the same for all gases: `Nodes`
     noise = data.rows.noise(data.grid.times, jnp.exp(data.rows.grains.log_error * steps))
     return filtered(
         jax.tree.map(lambda x: jnp.broadcast_to(x, (steps.size, *jnp.shape(x))), gas),

@@ -1,14 +1,19 @@
 """Measured values that lie far outside of all others, and the fit without them."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 
+from jaxgran.fitting.goodness import SIGNIFICANCE, goodness
+from jaxgran.fitting.information import inverse
 from jaxgran.fitting.problem import Problem
+from jaxgran.fitting.result import prefix_of
 from jaxgran.fitting.rows import CurveRows
 from jaxgran.fitting.search import Minimum, minimise
+from jaxgran.scene.parameters import symbol_of
 
 CHANCE = 1e-3
 """Probability that a fit without outliers has so large a residual."""
@@ -31,7 +36,31 @@ class Value(NamedTuple):
     column: int
 
 
-def without_outliers(
+def describe_outliers(problem: Problem, first: np.ndarray, max_steps: int) -> Iterator[str]:
+    """Yield the far outliers with the first parameter of a fit without them, if it is good.
+
+    Args:
+        problem, first, max_steps: see `_without_outliers`.
+    """
+    rest, end, left_out = _without_outliers(problem, first, max_steps)
+    found = rest.evaluate(end.flat)
+    if not left_out or goodness(rest, found).p_value < SIGNIFICANCE:
+        return
+    times = {m.label: np.asarray(m.curve.times) for m in problem.curves}
+    places = []
+    for value in sorted(left_out):
+        time = times[value.label][value.time]
+        places.append(f"{prefix_of(value.label)}t = {time:.3g} s (row {value.time + 1})")
+    symbol = symbol_of(problem.unknowns[0].name)
+    estimate = rest.estimates(end.flat)[0]
+    error = np.sqrt(inverse(found.information)[0, 0]) * rest.slopes(end.flat)[0]
+    yield (
+        f"far outliers at {', '.join(places)}: check them and their error bars; without them "
+        f"{symbol} is {estimate:.3g} +- {error:.2g}"
+    )
+
+
+def _without_outliers(
     problem: Problem, first: np.ndarray, max_steps: int
 ) -> tuple[Problem, Minimum, list[Value]]:
     """Leave out the values that fit worst, one by one, while their residuals are too large.

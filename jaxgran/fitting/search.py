@@ -21,7 +21,7 @@ CONVERGED_STEP = 0.03
 
 STALLED_STEP = 0.3
 """A search that has stalled has converged if the next Newton step is shorter than this, in standard
-errors. It stalls at a kink of -2 ln L, where a measured point passes t0."""
+errors. It stalls at a kink of -2 ln L, where a measured point passes t0, or by a learning rate."""
 
 MAX_STALLED = 6
 """A search has stalled after this number of successive steps that hardly lower -2 ln L."""
@@ -83,6 +83,24 @@ class Minimum(NamedTuple):
     steps: int
     converged: bool
     trace: Trace | None = None
+
+
+class Solution(NamedTuple):
+    """Where the searches of a problem end.
+
+    Attributes:
+        problem: of a fit.
+        best: the deepest minimum.
+        minima: all minima.
+    """
+
+    problem: Problem
+    best: Minimum
+    minima: list[Minimum]
+
+    def evaluate(self) -> Evaluation:
+        """Return -2 ln L at the deepest minimum."""
+        return self.problem.evaluate(self.best.flat)
 
 
 Minimiser = Callable[[Problem, np.ndarray, int], Minimum]

@@ -10,10 +10,11 @@ from jaxtyping import PRNGKeyArray
 from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.data.measurement import Measurement
 from jaxgran.fitting.alternatives import Explanations, compare_alternatives
+from jaxgran.fitting.assemble import describe_gas, parameter_ranges
 from jaxgran.fitting.comparison import Residuals
 from jaxgran.fitting.conclusions import with_conclusions
 from jaxgran.fitting.descent import Descent
-from jaxgran.fitting.estimate import describe_gas, fit_without_noise, parameter_ranges
+from jaxgran.fitting.estimate import fit_without_noise
 from jaxgran.fitting.goodness import goodness
 from jaxgran.fitting.information import undetermined
 from jaxgran.fitting.measured_rows import curve_rows, with_rate_error
@@ -178,7 +179,7 @@ def _result(
         covariances=covariances,
         ranges=parameter_ranges(problem, explanations),
         alternatives=() if explanations is None else explanations.alternatives,
-        **goodness(problem, found),
+        **goodness(problem, found)._asdict(),
         log_likelihood=-0.5 * found.value,
         residuals={"": _residuals_by_field(sims, rows)},
         scatter={"": (expansion.scatter, scatter_error)},

@@ -3,7 +3,7 @@
 Each step uses one simulation with new random numbers, and its derivatives. The estimate is the mean
 of the Gauss-Newton estimates of all simulations near it; the noise of the simulations is part of
 its error. Residuals are weighted by the covariance that kinetic theory gives to the measured run
-(`jaxgran.fitting.innovations`), the errors of the measurement and the noise of the simulations.
+(`jaxgran.fitting.kalman`), the errors of the measurement and the noise of the simulations.
 With an optax transformation each step is one simulation with its gradient in reverse mode, and the
 estimate is the mean of the last half of the steps (Polyak average).
 """
@@ -345,7 +345,8 @@ def by_descent(
         return jnp.sum(residuals**2) + jnp.sum(prior**2)
 
     def at(flat: np.ndarray, step: int) -> Loss:
-        return Loss(*jax.value_and_grad(loss)(jnp.asarray(flat), step))
+        value, gradient = jax.value_and_grad(loss)(jnp.asarray(flat), step)
+        return Loss(float(value), gradient)
 
     used = int(np.sum(sims.rows.used))
     course = descent.descend(at, first, max_simulations, used, sims.problem.estimates, noisy=True)

@@ -12,6 +12,7 @@ import jaxgran
 from jaxgran._utils.validation import Domain
 from jaxgran.fitting import alternatives, estimate, profiles
 from jaxgran.fitting.alternatives import Alternative, Explanations
+from jaxgran.fitting.goodness import Goodness
 from jaxgran.fitting.kinds import KINDS, WALLS_ADDED, FittedCurve
 from jaxgran.fitting.measured_rows import curve_rows
 from jaxgran.fitting.parameters import Unknown
@@ -127,8 +128,8 @@ VERDICTS = [
 def test_verdicts(monkeypatch, limitations, p_value, grade, verdict):
     gas, curve = cooled_beads(1, relative_error=0.002)
     monkeypatch.setattr(jaxgran.KineticTheory, "limitations", lambda *_, **__: limitations)
-    known = {"chi2": 40.0, "degrees_of_freedom": 39, "smooth_p_value": 0.5}
-    monkeypatch.setattr(estimate, "goodness", lambda *_: known | {"p_value": p_value})
+    quality = Goodness(40.0, 39, p_value, smooth_p_value=0.5)
+    monkeypatch.setattr(estimate, "goodness", lambda *_: quality)
     result = fitted(gas, curve, num_particles=10**6, quick=False)
     assert result.grade == grade
     assert re.fullmatch("Kinetic theory" + verdict, result.verdict)

@@ -9,7 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran.fitting.comparison import Comparison
-from jaxgran.fitting.innovations import SAMPLE_MEMORY, Nodes, filtered
+from jaxgran.fitting.kalman import SAMPLE_MEMORY, Nodes, filtered
 from jaxgran.fitting.measured_rows import curve_rows
 from jaxgran.fitting.prediction import predicted_curve
 from jaxgran.fitting.rows import Noise
@@ -97,7 +97,7 @@ def test_the_error_of_a_sample_of_grains_is_remembered():
     tau = np.geomspace(0.1, 6.0, size)
     values = 0.1 * np.random.default_rng(0).standard_normal(size)
     column = np.zeros((size, 1))
-    nodes = Nodes(tau, column, column, column[:, 0], tau[:, None])
+    nodes = Nodes(column, column, column[:, 0], tau[:, None])
     noise = Noise(np.zeros(1), 0.0, np.zeros(size), variance, 0.0)
     residuals = np.zeros((size, 2, 1, 1))
     residuals[:, 0, 0, 0] = values

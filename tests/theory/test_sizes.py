@@ -9,7 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran._utils.tracing import fast_jit
-from jaxgran.fitting.innovations import Nodes, filtered
+from jaxgran.fitting.kalman import Nodes, filtered
 from jaxgran.fitting.rows import Noise
 from jaxgran.scene.reduced import reduced_scene
 from jaxgran.theory import sizes
@@ -182,7 +182,7 @@ def test_the_filter_is_the_covariance(energy):
 
     log_T = jnp.log(curve.temperature)
     nodes = Nodes(
-        times, one(log_T), 0 * one(log_T), curve.sonine, one(curve.collisions), one(q), one(slope)
+        one(log_T), 0 * one(log_T), curve.sonine, one(curve.collisions), one(q), one(slope)
     )
     residual = np.random.default_rng(0).normal(size=times.size) * 0.01
     residuals = np.zeros((times.size, 2, 1, 1))

@@ -1,0 +1,331 @@
+"""The Kalman filter of a measured curve, which `log_likelihood` and every fit call.
+
+The residuals of a run of N grains are a Gaussian process. Between two times the fluctuations about
+kinetic theory obey a linear stochastic equation (`jaxgran.theory.covariance`); its solution is
+compared with the measured values one after the other. Each value then has an innovation, its
+residual minus what is expected from all values before it, and the variance of that:
+``-2 ln L = sum innovation^2/variance + ln variance``. No matrix of all points is formed, so that a
+curve of a thousand points costs no more than its points.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxgran.fitting.rows import Noise
+from jaxgran.scene.gas import Gas
+from jaxgran.theory.covariance import (
+    NUM_DOUBLINGS,
+    ROTATION_OFFSET,
+    Mean,
+    product,
+    propagators,
+    run_process,
+    transposed,
+)
+from jaxgran.theory.moments import Spins
+
+LOG_T = 0
+"""Place of ln T among the variables of a run (`jaxgran.theory.covariance`)."""
+
+RATIO = 1
+"""Place of y of rough spheres, or of q of spheres of unequal sizes, among them."""
+
+RATE_ERROR_LENGTH = 1.0
+"""Change of ln T over which the error of theory's cooling rate is correlated."""
+
+SAMPLE_MEMORY = 0.57
+"""Decay of the sampling error of T, over the collisions of a grain.
+
+Measured: 60 of 250 spheres, eps = .9, 400 replicas: correlations .75, .56, .42, .33, .26, .20 after
+.5, 1, ..., 3 collisions."""
+
+SMALLEST_VARIANCE = 1e-12
+"""Relative variance that is added to each value, so that exact ones do not divide by 0."""
+
+
+class Nodes(NamedTuple):
+    """Curves of some neighbouring gases at nodes.
+
+    Nodes are times from 0 on, which include the times of the data. Arrays have the shape
+    (nodes, gases): operations on small matrices are fast where the last axis is long.
+
+    Attributes:
+        log_temperature: ln T, T in m^2/s^2.
+        rotation: T_rot/T; 0 for smooth spheres.
+        sonine: a_2, shape (nodes,).
+        collisions: per particle.
+        size_ratio: q of spheres of unequal sizes (`jaxgran.theory.sizes`); None for equal spheres.
+        by_size_ratio: derivative of ln T in q, for the measured T: 0 unless T is given by the
+            energy; None for equal spheres.
+    """
+
+    log_temperature: Any
+    rotation: Any
+    sonine: Any
+    collisions: Any
+    size_ratio: Any = None
+    by_size_ratio: Any = None
+
+
+class Filtered(NamedTuple):
+    """Innovations of columns of residuals, which share their variances.
+
+    Attributes:
+        values: 0 where nothing is used, shape (nodes, 2, columns, gases).
+        variances: of the innovations; where nothing is used, the variance that a value would
+            have; shape (nodes, 2, gases).
+    """
+
+    values: Any
+    variances: Any
+
+
+def filtered(
+    gas: Gas,
+    nodes: Nodes,
+    residuals: Float[Array, "nodes 2 columns gases"],
+    variances: Float[Array, "nodes 2 gases"],
+    sensitivity: Float[Array, "nodes gases"],
+    used: Float[Array, "nodes 2"],
+    noise: Noise,
+    *,
+    differentiable: bool = False,
+) -> Filtered:
+    """Return the innovations of columns of residuals, and the variances that they share.
+
+    Args:
+        gas: neighbouring scenes: its floats have an axis (gases,).
+        nodes: their curves by kinetic theory.
+        residuals: of T and of T_rot, relative.
+        variances: of their independent errors.
+        sensitivity: derivative of the computed ln T in ln T of the gas: 1 without a noise floor.
+        used: 1 where a value counts, 0 elsewhere.
+        noise: what makes them scatter beside these errors; its `inverse_number` has the shape
+            (gases,), and its `white` is part of the variances.
+        differentiable: whether derivatives in reverse mode are taken.
+    """
+    with jax.numpy_rank_promotion("allow"):  # the gases are the last axis of all arrays
+        steps = _steps(gas, nodes, noise, differentiable)
+        start = _start(steps, noise, residuals)
+        unit = jnp.eye(len(start.mean), dtype=residuals.dtype)[..., None]
+        turning = nodes.rotation > 0
+        of_y = (nodes.rotation + ROTATION_OFFSET) / jnp.where(turning, nodes.rotation, jnp.inf)
+        at_nodes = _AtNode(
+            growth=steps.growth,
+            increment=steps.increments,
+            rotation_slope=of_y,
+            by_size_ratio=nodes.by_size_ratio,
+            residuals=residuals,
+            variances=variances + SMALLEST_VARIANCE,
+            sensitivity=sensitivity,
+            used=used,
+        )
+        _, found = jax.lax.scan(partial(_filter_step, unit), start, at_nodes)
+    return found
+
+
+class _Steps(NamedTuple):
+    """What happens to the variables of a run from each node's predecessor to it.
+
+    The variables of the run (`jaxgran.theory.covariance.process`) are followed by the relative
+    error of theory's cooling rate over its standard deviation, and by the sampling error: n
+    variables in all.
+
+    Attributes:
+        start: covariance of the variables of the run at its start, shape (n - 2, n - 2, gases).
+        growth: propagators less 1, shape (nodes, n, n, gases).
+        increments: what is added to the covariance, shape (nodes, n, n, gases).
+    """
+
+    start: Any
+    growth: Any
+    increments: Any
+
+
+def _steps(gas: Gas, nodes: Nodes, noise: Noise, differentiable: bool) -> _Steps:
+    """Return the steps of all variables; the sampling error is independent of all others."""
+    process = _process(gas, nodes, noise)
+    shape = process.drift.shape
+    flat = (*shape[:2], -1)
+    doublings = NUM_DOUBLINGS if differentiable else _needed_doublings(process.drift)
+    of_run = propagators(process.drift.reshape(flat), process.noise.reshape(flat), doublings)
+    growth, increments = (_with_one_more_variable(x.reshape(shape)) for x in of_run)
+    sample = shape[0]
+    collisions = _change(nodes.collisions)
+    forgotten = jnp.expm1(-SAMPLE_MEMORY * collisions)
+    sampled = -noise.sample * jnp.expm1(-2 * SAMPLE_MEMORY * collisions)
+    return _Steps(
+        start=process.start,
+        growth=growth.at[:, sample, sample].set(forgotten),
+        increments=increments.at[:, sample, sample].set(sampled),
+    )
+
+
+class _Process(NamedTuple):
+    """The linear stochastic equation of the variables of a run and of the error of the rate.
+
+    Attributes:
+        start: covariance of the variables of the run at its start, see `_Steps`.
+        drift: matrix of the equation times each step, shape (n - 1, n - 1, nodes, gases).
+        noise: covariance of its noise times each step, of the same shape.
+    """
+
+    start: Array
+    drift: Array
+    noise: Array
+
+
+def _process(gas: Gas, nodes: Nodes, noise: Noise) -> _Process:
+    """Return the equation, whose coefficients are constant from a node to the next one."""
+    first = nodes.log_temperature[:1]
+    means = Mean(
+        nodes.log_temperature - first,
+        jnp.broadcast_to(nodes.sonine[:, None], nodes.rotation.shape),
+        nodes.collisions,
+        Spins(nodes.rotation, None, None),
+        nodes.size_ratio,
+    )
+    rates = jax.vmap(run_process, in_axes=(0, -1), out_axes=-1)
+    jacobian, spread, starts = rates(gas, jax.tree.map(_middle, means))
+    collisions = _change(nodes.collisions)
+    rate_error = len(jacobian)
+    size = rate_error + 1
+    zeros = jnp.zeros((size, size, *nodes.rotation.shape), jacobian.dtype)
+    of_grains = noise.inverse_number * spread * collisions
+    random = zeros.at[:rate_error, :rate_error].set(of_grains)
+    drift = zeros.at[:rate_error, :rate_error].set(jacobian * collisions)
+    # An error of the rate moves all temperatures along their mean course.
+    error = _middle(noise.rate_error)[:, None]
+    change_of_T = _change(nodes.log_temperature)
+    drift = drift.at[LOG_T, rate_error].set(error * change_of_T)
+    if gas.surface is not None:
+        change_of_y = _change(jnp.log(nodes.rotation + ROTATION_OFFSET))
+        drift = drift.at[RATIO, rate_error].set(error * change_of_y)
+    if nodes.size_ratio is not None:
+        drift = drift.at[RATIO, rate_error].set(error * _change(nodes.size_ratio))
+    memory = jnp.abs(change_of_T) / RATE_ERROR_LENGTH
+    return _Process(
+        start=noise.inverse_number * starts[:, :, 0],
+        drift=drift.at[rate_error, rate_error].set(-memory),
+        noise=random.at[rate_error, rate_error].set(2 * memory),
+    )
+
+
+def _needed_doublings(drift: Array) -> Array:
+    """Return the doublings of a step in which no variable changes by more than 1/64 of itself."""
+    longest = jnp.max(jnp.abs(drift))
+    return jnp.clip(jnp.ceil(jnp.log2(64 * longest)), 1, NUM_DOUBLINGS).astype(int)
+
+
+def _with_one_more_variable(x: Float[Array, "n n nodes gases"]) -> Array:
+    """Return matrices with one more row and column of 0, shape (nodes, n + 1, n + 1, gases)."""
+    padded = jnp.pad(x, [(0, 1), (0, 1), (0, 0), (0, 0)])
+    return jnp.moveaxis(padded, 2, 0)
+
+
+def _middle(x: Array) -> Array:
+    """Return the mean of each row and the row before it; the first row as it is."""
+    return jnp.concatenate([x[:1], (x[1:] + x[:-1]) / 2])
+
+
+def _change(x: Array) -> Array:
+    """Return the difference of each row to the row before it, 0 for the first."""
+    return jnp.diff(x, prepend=x[:1], axis=0)
+
+
+class _State(NamedTuple):
+    """What is expected of the n variables of a run, given all values so far.
+
+    Attributes:
+        mean: shape (n, columns, gases).
+        covariance: shape (n, n, gases).
+    """
+
+    mean: Array
+    covariance: Array
+
+
+def _start(steps: _Steps, noise: Noise, residuals: Array) -> _State:
+    """Return the state at t = 0, before any of some residuals."""
+    size = steps.growth.shape[1]
+    rate_error = size - 2
+    sample = size - 1
+    mean = jnp.zeros((size, *residuals.shape[2:]), residuals.dtype)
+    covariance = jnp.zeros((size, size, residuals.shape[-1]), residuals.dtype)
+    covariance = covariance.at[:rate_error, :rate_error].set(steps.start)
+    covariance = covariance.at[LOG_T, LOG_T].add(noise.inverse_number * noise.first)
+    covariance = covariance.at[rate_error, rate_error].set(1.0)
+    covariance = covariance.at[sample, sample].set(noise.sample)
+    return _State(mean, covariance)
+
+
+class _AtNode(NamedTuple):
+    """One node in the filter: the way to it, and what is measured there.
+
+    Attributes:
+        growth, increment: see `_Steps`.
+        rotation_slope: derivative of ln T_rot in y, 0 for smooth spheres.
+        by_size_ratio: see `Nodes`.
+        residuals, variances, sensitivity, used: see `filtered`.
+    """
+
+    growth: Array
+    increment: Array
+    rotation_slope: Array
+    by_size_ratio: Array | None
+    residuals: Array
+    variances: Array
+    sensitivity: Array
+    used: Array
+
+
+def _filter_step(unit: Array, state: _State, at: _AtNode) -> tuple[_State, Filtered]:
+    """Return the state after the values of a node, and their innovations and variances.
+
+    Args:
+        unit: unit vectors of the variables, shape (n, n, 1).
+        state: at the node before.
+        at: the node.
+    """
+    growth = at.growth
+    mean = state.mean + jnp.sum(growth[:, :, None] * state.mean[None], axis=1)
+    moved = state.covariance + product(growth, state.covariance)
+    covariance = moved + product(moved, transposed(growth)) + at.increment
+    state = _State(mean, covariance)
+    # Measured: ln T of the gas with the sampling error, and ln T_rot = ln T + ln(T_rot/T).
+    sample = len(mean) - 1
+    of_T = at.sensitivity * unit[LOG_T] + unit[sample]
+    if at.by_size_ratio is not None:  # T by the energy also depends on q
+        of_T = of_T + at.sensitivity * at.by_size_ratio * unit[RATIO]
+    of_rotation = unit[LOG_T] + at.rotation_slope * unit[RATIO]
+    innovations = []
+    variances = []
+    for column, weights in enumerate((of_T, of_rotation)):
+        state, innovation, variance = _with_value(
+            state, weights, at.residuals[column], at.variances[column], at.used[column]
+        )
+        innovations.append(innovation)
+        variances.append(variance)
+    return state, Filtered(jnp.stack(innovations), jnp.stack(variances))
+
+
+def _with_value(
+    state: _State, weights: Array, value: Array, variance: Array, used: Array
+) -> tuple[_State, Array, Array]:
+    """Return the state after a value, its innovation and its variance.
+
+    The value is the sum of the variables with these weights, shape (n, gases), and an independent
+    error of the given variance.
+    """
+    mean, covariance = state
+    with_value = jnp.sum(covariance * weights, axis=1)
+    total = jnp.sum(weights * with_value, axis=0) + variance
+    innovation = used * (value - jnp.sum(weights[:, None] * mean, axis=0))
+    gain = used * with_value / total
+    mean = mean + gain[:, None] * innovation[None]
+    covariance = covariance - total * gain[:, None] * gain[None]
+    return _State(mean, covariance), innovation, total
