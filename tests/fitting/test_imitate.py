@@ -126,7 +126,9 @@ def test_interrupted_imitations_give_what_they_have(monkeypatch):
 
     monkeypatch.setattr(module, "fit", interrupted)
     found = jaxgran.imitate(result, 5, progress=False)
-    assert (found.runs, found.asked, found.strongest) == (3, 5, None)
+    # A fit that has begun when another one is interrupted is counted.
+    assert 3 <= found.runs == len(fits) < found.asked == 5
+    assert found.strongest is None
     assert found.width == pytest.approx(np.median((found.high - found.low) / found.value), rel=1e-2)
     assert "interrupted" in repr(found)
 

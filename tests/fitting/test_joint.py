@@ -118,7 +118,7 @@ def test_curves_and_drops_together():
     assert in_range(result, dilute.value(A))
     assert not any(x.preferred for x in result.alternatives)
     # Contacts of the dense gas last too long.
-    assert "though these measurements fit" in result.verdict
+    assert "although the fit to these measurements is good" in result.verdict
     # Alone each curve knows less.
     for label in curves:
         alone = jaxgran.fit(data[label], free=(A, "temperature"), quick=True)

@@ -1,6 +1,7 @@
 """An unknown start of the clock."""
 
 import dataclasses
+import re
 
 import jax
 import numpy as np
@@ -49,7 +50,7 @@ def test_t0_and_the_first_temperature_are_not_found_together():
     with pytest.warns(UserWarning, match="T0 and t0: .*forgets"):
         both = fitted(gas, curve, free=(A, "temperature", "t0"), quick=False)
     assert both.undetermined == ("temperature", "t0") and both.converged
-    assert repr(both).count("not determined") == 2
+    assert len(re.findall(r"(T\S*|t0) +not determined", repr(both))) == 2
     # The constant of the material does not depend on where the course begins.
     alone = fitted(gas, curve, free=(A, "temperature"))
     error = float(alone.error_budget["measurement"][0])
