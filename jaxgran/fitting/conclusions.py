@@ -36,7 +36,8 @@ def with_conclusions(
     """
     limitations = limitations_of(request.model, result)
     misfit = misfit_of(result, measurement_share)
-    grade, sentence = verdict(result, misfit, limitations)
+    not_computed = () if explanations is None else explanations.not_computed
+    grade, sentence = verdict(result, misfit, limitations, not_computed)
     reasons = (
         *describe_fit(result, misfit, request.model),
         *describe_comparison(request, result, explanations),

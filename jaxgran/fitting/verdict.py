@@ -91,8 +91,21 @@ def limitations_of(model: AbstractModel, result: Fit) -> list[Limitation]:
     return sorted(by_words.values(), key=lambda limitation: not limitation.decisive)
 
 
-def verdict(result: Fit, misfit: Misfit, limitations: list[Limitation]) -> tuple[str, str]:
-    """Return the grade of a fit, and the sentence that says it."""
+def verdict(
+    result: Fit,
+    misfit: Misfit,
+    limitations: list[Limitation],
+    not_computed: tuple[str, ...] = (),
+) -> tuple[str, str]:
+    """Return the grade of a fit, and the sentence that says it.
+
+    Args:
+        result: the numbers of the fit.
+        misfit: see `misfit_of`.
+        limitations: see `limitations_of`.
+        not_computed: names of alternatives that could not be computed, so that nothing excludes
+            them.
+    """
     if not result.converged:
         return NOT_CONSISTENT, "The search did not converge: do not trust its estimates."
     name = result.model_name
@@ -110,7 +123,7 @@ def verdict(result: Fit, misfit: Misfit, limitations: list[Limitation]) -> tuple
     if any(limitation.decisive for limitation in limitations):
         words = f"{model} cannot be trusted in this scene, although the fit to {data} is good."
         return NOT_CONSISTENT, _joined(words, remedy)
-    doubt = _doubt(result)
+    doubt = _doubt(result, not_computed)
     if doubt is not None:
         words = f"{model_is} consistent with {data}, but {symbol} is not determined: {doubt}."
         return NOT_DETERMINED, _joined(words, edge)
@@ -147,7 +160,7 @@ def _preferred(result: Fit, best: Alternative) -> str:
     return f"The data prefer a model with {best.name}, in which {value}."
 
 
-def _doubt(result: Fit) -> str | None:
+def _doubt(result: Fit, not_computed: tuple[str, ...]) -> str | None:
     """Return why the first parameter is not determined; None if nothing is known against it."""
     if len(result.other_minima):
         data, _ = data_and_verb(result)
@@ -163,6 +176,8 @@ def _doubt(result: Fit) -> str | None:
     if possible:
         simplest = min(possible, key=lambda alternative: alternative.num_parts)
         return f"{simplest.name} cannot be excluded; over all explanations {span}"
+    if not_computed:
+        return f"{not_computed[0]} could not be computed; over all other explanations {span}"
     return span if low >= 0 and high > MAX_RATIO * low else None
 
 

@@ -286,6 +286,8 @@ def test_alternatives_that_cannot_be_computed_are_named_and_not_among_the_explan
     assert "constant restitution" not in result.headline
     (reason,) = (x for x in result.reasons if x.startswith("alternatives not computed: "))
     assert WALLS_ADDED in reason and "a constant coefficient of restitution" in reason
+    assert result.grade == "not determined"
+    assert f"{WALLS_ADDED} could not be computed; over all other explanations" in result.verdict
 
 
 def test_amplitudes_beyond_one_that_cannot_be_computed_are_tried(monkeypatch):
