@@ -17,6 +17,9 @@ UNITS = {
 }
 """Units of length (m), time (s) and mass (kg), by their names in LAMMPS."""
 
+DENSITY_UNITS = {"metal": 1e3, "real": 1e3}
+"""Units of density (kg/m^3), where they are not a mass over a length cubed."""
+
 POSITIONS = (("xu", "yu", "zu"), ("x", "y", "z"), ("xs", "ys", "zs"), ("xsu", "ysu", "zsu"))
 """Accepted names of columns of positions, in order of preference; s stands for scaled ones."""
 
@@ -26,12 +29,12 @@ SPIN = ("omegax", "omegay", "omegaz")
 
 EQUAL = {
     **dict.fromkeys(("type", "element", "species", "Z", "q", "shapex", "shapey", "shapez")),
-    **dict.fromkeys(("diameter", "radius"), (1, 0)),
-    **dict.fromkeys(("mass", "masses"), (0, 1)),
-    "density": (-3, 1),
+    **dict.fromkeys(("diameter", "radius"), "length"),
+    **dict.fromkeys(("mass", "masses"), "mass"),
+    "density": "density",
 }
 """Columns that must be equal for all particles, as gases of jaxgran consist of equal spheres, and
-the powers of m and kg in the unit of numbers."""
+the kind of unit of their numbers."""
 
 
 class Frame(NamedTuple):
@@ -103,13 +106,14 @@ def frame_of_columns(
             "not momenta), or particles/velocity into every frame (GSD; HOOMD needs "
             "dynamic=['property', 'momentum'] for it)"
         )
-    if not columns.keys() & {"x", "xu"}:
+    if _first_vector(columns, POSITIONS[:2]) is None:  # scaled
         position = low + position * sides
     sides = length * sides[:d]
     low = length * low[:d]
     position = length * position[:, :d] - low
     velocity = length / second * velocity
-    equal = _equal_columns(columns, length, kilogram)
+    density = DENSITY_UNITS.get(units.lower(), kilogram / length**3)
+    equal = _equal_columns(columns, {"length": length, "mass": kilogram, "density": density})
     is_periodic = all(periodic[:d])
     finite = all(np.all(np.isfinite(x)) for x in (position, velocity, sides))
     outside = np.any((position < 0) | (position > sides)) and not is_periodic
@@ -155,24 +159,23 @@ def _first_vector(
 
 
 def _equal_columns(
-    columns: dict[str, np.ndarray], length: float, kilogram: float
+    columns: dict[str, np.ndarray], units: dict[str, float]
 ) -> dict[str, np.ndarray]:
     """Return the columns of `EQUAL` in SI; raise ValueError if the particles differ in one.
 
     Args:
         columns: by name.
-        length: unit of length, m.
-        kilogram: unit of mass, kg.
+        units: of length, mass and density, SI.
     """
     equal = {}
     different = []
-    for name in EQUAL.keys() & columns.keys():
-        powers = EQUAL[name]
+    for name in (x for x in EQUAL if x in columns):
+        unit = EQUAL[name]
         values = columns[name]
-        if powers is None:
+        if unit is None:
             is_equal = len(set(values)) <= 1
         else:
-            values = length ** powers[0] * kilogram ** powers[1] * values.astype(float)
+            values = units[unit] * values.astype(float)
             is_equal = np.ptp(values) <= FLOAT32_TOLERANCE * np.max(np.abs(values))
         equal[name] = values
         if not is_equal:

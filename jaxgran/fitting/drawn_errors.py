@@ -12,6 +12,7 @@ from jaxgran.data.measurement import DENSITY, START_TIME, Measurement, Priors, p
 from jaxgran.fitting.kalman import SAMPLE_MEMORY
 from jaxgran.fitting.measured_rows import sampling_variance
 from jaxgran.fitting.result import Fit
+from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 
 TEMPERATURES = ("temperature", "rotational_temperature")
 
@@ -46,6 +47,9 @@ def imitations(
         if name == "temperature":
             values = values * np.exp(_sampling_errors(measurement, curve, runs, rng))
             found = result.errors_of_T.get("", 0.0)
+        else:
+            spins = NUM_SPIN_COMPONENTS[measurement.gas.dimension]
+            found = sampling_variance(measurement, spins) ** 0.5
         error = getattr(measurement.curve, f"{name}_error")
         noise = np.expm1(found * rng.normal(size=values.shape)) * values
         if error is not None:
@@ -69,7 +73,7 @@ def _sampling_errors(
     measurement: Measurement, curve: CoolingCurve, runs: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "runs times"]:
     """Return errors of ln T of some tracked grains in place of all."""
-    variance = sampling_variance(measurement)
+    variance = sampling_variance(measurement, measurement.gas.dimension)
     shape = runs, measurement.curve.times.size
     if variance == 0:
         return np.zeros(shape)

@@ -28,6 +28,9 @@ DISTANT_FACTOR = 3.0
 """Factor between measured and fitted T. If `DISTANT_SHARE` of the values differ by more, the scale
 of T or of time is wrong."""
 
+NEGLIGIBLE_SCATTER = 1e-3
+"""Standard deviation of eps from impact to impact up to which it is not reported."""
+
 DISTANT_SHARE = 0.8
 """Share of such values: where T has fallen most, a curve in another unit may come near."""
 
@@ -63,8 +66,9 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
         )
     elif quality.p_value < SIGNIFICANCE and not request.quick:
         notes += describe_outliers(plain.problem, first, max_steps)
-    if found.scatter_of_eps is not None:
-        notes.append(f"eps of the impacts scatters by {found.scatter_of_eps:.2g} beyond its errors")
+    scatter = found.scatter_of_eps
+    if scatter is not None and scatter > NEGLIGIBLE_SCATTER:
+        notes.append(f"eps of the impacts scatters by {scatter:.2g} beyond its errors")
     share = measurement_share(solution.problem, found)
     return with_conclusions(request, result, explanations, notes, share)
 
@@ -122,7 +126,10 @@ def _with_errors_of_T(plain: Solution, first: np.ndarray, max_steps: int) -> Sol
     unknowns = [unknown_of(WHITE, m.label, m.scene, problem.curves) for m in bare]
     sizes = [_guess_of_error(m, computed[m.label]["temperature"]) for m in bare]
     wider = replace(problem, unknowns=(*problem.unknowns, *unknowns))
-    solution = _solve_by_newton(wider, np.append(first, np.log(sizes)), max_steps)
+    try:
+        solution = _solve_by_newton(wider, np.append(first, np.log(sizes)), max_steps)
+    except RuntimeError:  # no curve is computed where this search ends
+        return plain
     is_better = solution.best.value <= plain.best.value - ALLOWED
     return solution if is_better and solution.best.converged else plain
 

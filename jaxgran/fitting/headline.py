@@ -4,6 +4,7 @@ import numpy as np
 
 from jaxgran.fitting.alternatives import DISTINGUISHABLE_SHARE, Explanations
 from jaxgran.fitting.kinds import DECLARABLE
+from jaxgran.fitting.parameters import magnitude_of
 from jaxgran.fitting.result import CONDITIONAL, Fit
 from jaxgran.scene.parameters import symbol_of, unit_of
 
@@ -63,7 +64,7 @@ def first_range(result: Fit) -> tuple[float, float]:
 
 def _is_wide(low: float, high: float, estimate: float) -> bool:
     """Tell whether the range of a positive parameter is too wide for an estimate to be given."""
-    return low >= 0 and (low < NEGLIGIBLE_SHARE * abs(estimate) or high > MAX_RATIO * low)
+    return low >= 0 and (low < NEGLIGIBLE_SHARE * magnitude_of(estimate) or high > MAX_RATIO * low)
 
 
 def describe_range(result: Fit, low: float, high: float) -> str:
@@ -71,11 +72,11 @@ def describe_range(result: Fit, low: float, high: float) -> str:
     name = result.names[0]
     symbol = symbol_of(name)
     unit = unit_after_number(name)
-    estimate = abs(float(result.estimate[0]))
-    is_open = not high < UNBOUNDED * max(estimate, low)
+    estimate = magnitude_of(float(result.estimate[0]))
+    is_open = not np.isfinite(high) or (low >= 0 and high >= UNBOUNDED * max(estimate, low))
     if 0 <= low < NEGLIGIBLE_SHARE * estimate:
         if is_open:
-            return f"{symbol} is not determined"
+            return f"{symbol} has no bounds"
         return f"{symbol} is below {high:.3g}{unit}"
     if is_open:
         return f"{symbol} is above {low:.3g}{unit}"
@@ -96,7 +97,7 @@ def narrowing(result: Fit, explanations: Explanations | None) -> str:
     low, high = (float(end[0]) for end in explanations.ranges(absent=effects))
     lowest, highest = (float(end[0]) for end in explanations.ranges())
     gain = max(low - lowest, highest - high)
-    if not gain > DISTINGUISHABLE_SHARE * abs(result.estimate[0]):
+    if not gain > DISTINGUISHABLE_SHARE * magnitude_of(float(result.estimate[0])):
         return ""
     keys = ", ".join(DECLARABLE[effect].keys for effect in effects)
     return (

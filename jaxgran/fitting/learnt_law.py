@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxgran._utils.validation import POSITIVE
 from jaxgran.data.curve import CoolingCurve, above_noise
+from jaxgran.data.drop_test import DropTest
 from jaxgran.fitting.parameters import residuals_and_slopes, with_values
 from jaxgran.fitting.result import Fit
 from jaxgran.scene.gas import Gas
@@ -133,6 +134,8 @@ def describe_unvisited_knots(result: Fit) -> Iterator[str]:
     gas = first_gas(result)
     if not isinstance(gas.law, RestitutionSpline) or "drops" not in result.names:
         return
+    if all(isinstance(m.data, DropTest) for m in result.measurements.values()):
+        return  # impacts at given speeds
     low, high = visited_speeds(result)
     knots = np.asarray(gas.law.speeds)
     outside = [f"{v:.2g}" for v in knots if not low / KNOT_MARGIN < v < high * KNOT_MARGIN]

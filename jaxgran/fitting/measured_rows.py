@@ -59,6 +59,11 @@ def curve_rows(
     gas = measurement.gas
     values = _values(measurement)
     errors, notes = errors_that_count(measurement)
+    if _has_rotation(measurement):
+        # The filter has no memory of sampled spins: their errors count as those of single values.
+        spins = NUM_SPIN_COMPONENTS[gas.dimension]
+        sampled = values[:, 1] * sampling_variance(measurement, spins) ** 0.5
+        errors[:, 1] = np.hypot(errors[:, 1], sampled)
     displacement = None
     if not fits_t0:
         displacement, notes_on_displacement = _displacement(measurement, model)
@@ -235,19 +240,24 @@ def _grains(measurement: Measurement, fits_T_0: bool) -> Grains:
     return Grains(
         inverse_number=1 / ((UNKNOWN_NUMBER if N is None else N) * measurement.replicas),
         log_error=WEAK_SCATTER if N is None else SCATTER_ERROR,
-        sample=sampling_variance(measurement),
+        sample=sampling_variance(measurement, measurement.gas.dimension),
         first=2 / measurement.gas.dimension if is_ensemble else 0.0,
     )
 
 
-def sampling_variance(measurement: Measurement) -> float:
-    """Return the variance of ln T where some of the grains are tracked; 0 if all are."""
+def sampling_variance(measurement: Measurement, components: int) -> float:
+    """Return the variance of ln T where some of the grains are tracked; 0 if all are.
+
+    Args:
+        measurement: of a curve.
+        components: of the velocity of a grain, or of its spin for ln T_rot.
+    """
     tracked = measurement.tracked
     if tracked is None:
         return 0.0
     N = measurement.num_particles
     left = 1 - (0 if N is None else tracked / N)
-    return 2 / (measurement.gas.dimension * tracked * measurement.replicas) * left
+    return 2 / (components * tracked * measurement.replicas) * left
 
 
 def _finite_size_factor(measurement: Measurement) -> float:

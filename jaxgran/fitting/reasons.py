@@ -22,6 +22,9 @@ MAX_ERROR_OF_N = 1.0
 NEARLY_CERTAIN = 0.99
 """Probability by chance from which it is not reported in digits."""
 
+NEGLIGIBLE_ERROR = 1e-4
+"""Relative error of T up to which it is not reported."""
+
 MIN_REDUCTION = 1.1
 """Smallest factor by which errors are said to have to shrink: less would be rounded to 1."""
 
@@ -53,7 +56,7 @@ def _chi2(result: Fit) -> str:
     chance = f"{100 * p_value:.2g} %" if p_value < NEARLY_CERTAIN else "over 99 %"
     return (
         f"reduced chi^2 is {result.reduced_chi2:.3g} for {int(result.degrees_of_freedom)} degrees "
-        f"of freedom (probability by chance: {chance})"
+        f"of freedom (a worse fit by chance: {chance})"
     )
 
 
@@ -69,7 +72,7 @@ def _reasons_of_misfit(result: Fit, misfit: Misfit) -> Iterator[str]:
         as_few = ""
         if len(known) == 1 and known[0] is not None:
             number = _two_digits(known[0] / result.reduced_chi2)
-            as_few = f"; about {number:g} grains would scatter as much"
+            as_few = f"; without errors of T about {number:g} grains would scatter as much"
         yield (
             "the data scatter more about the model than their errors and N equal spheres allow; "
             "possible causes: another effect, a mixture of sizes, eps that scatters, fewer grains "
@@ -107,6 +110,8 @@ def _scatter(result: Fit) -> Iterator[str]:
 def _errors_of_T(result: Fit) -> Iterator[str]:
     """Yield the errors of T that a fit found in curves without errors."""
     for label, error in result.errors_of_T.items():
+        if error < NEGLIGIBLE_ERROR:
+            continue  # another curve has the errors
         advice = "Give T_err if they are known"
         if result.measurements[label].curve.temperature_error is not None:
             advice = "If T_err are errors of the measurement, say so: `errors: measured`"
@@ -190,7 +195,7 @@ def describe_comparison(
     if any(m.gas.drive is not None for m in request.measurements.values()):
         yield "alternatives were not compared: the gas is driven"
     if request.model.stochastic and result.alternatives:
-        yield ("the range over alternatives comes from kinetic theory, shifted to the fitted curve")
+        yield "alternatives are compared by kinetic theory, shifted to the fitted curve"
     if explanations is not None and explanations.not_computed:
         yield (
             f"alternatives not computed: {', '.join(explanations.not_computed)}; the range does "
@@ -208,13 +213,12 @@ def _preferred(result: Fit, alternative: Alternative) -> Iterator[str]:
     name = alternative.name
     eps = alternative.restitution
     decreases = (
-        f"decreases -2 ln L by {alternative.improvement:.3g}, which happens by chance in less "
-        "than 1 % of fits"
+        f"decreases -2 ln L by {alternative.improvement:.3g} (by chance in less than 1 % of fits)"
     )
     low, high = _range_of(alternative)
     if eps is None:
         span = describe_range(result, low, high)
-        yield f"{name} added to the model {decreases}; in this case {span}"
+        yield f"{name} added to the model {decreases}; with it {span}"
     else:
         yield f"{name}, {eps:.3g}, in place of the fitted law {decreases}: A has no meaning then"
     estimate = float(result.estimate[0])
@@ -237,7 +241,7 @@ def _possible(result: Fit, alternative: Alternative) -> str:
     span = describe_range(result, *_range_of(alternative))
     factor = _two_digits(max(alternative.error_reduction_needed, MIN_REDUCTION))
     return (
-        f"{name} cannot be excluded; in this case {span}; errors {factor:g} times smaller would "
+        f"{name} cannot be excluded; with it {span}; errors {factor:g} times smaller would "
         "exclude this explanation or make it negligible"
     )
 
@@ -257,8 +261,8 @@ def describe_surroundings(result: Fit) -> Iterator[str]:
         N = m.num_particles
         if gas.container is not None:
             yield (
-                "gravity is taken as absent: in one simulated box with walls of restitution 0.8, a "
-                "gravity of 0.1 m/s^2 made A 9 % too small"
+                f"{prefix_of(label)}gravity is neglected: in one simulated box, with walls of "
+                "restitution 0.8, a gravity of 0.1 m/s^2 made the fitted A 9 % too small"
             )
         elif N is not None and "walls" not in m.absent:
             yield f"{prefix_of(label)}the box of {N} spheres {describe_walls(gas, N)}"
@@ -273,10 +277,10 @@ def describe_convergence(result: Fit) -> Iterator[str]:
     noise = result.error_budget.get("simulation")
     if noise is not None:
         share = 100 * float(np.max(noise / result.standard_error))
-        yield (
-            f"{result.iterations} simulations were run; their noise is at most {share:.0f} % of "
-            "the standard error"
+        words = (
+            f"at most {share:.0f} % of the standard error" if np.isfinite(share) else "not known"
         )
+        yield f"{result.iterations} simulations were run; their noise is {words}"
 
 
 def describe_search(result: Fit) -> Iterator[str]:
@@ -297,12 +301,12 @@ def describe_search(result: Fit) -> Iterator[str]:
             "parameters"
         )
     if len(result.other_minima):
-        symbols = [symbol_of(name) for name in result.names]
+        symbols = [symbol_of(name) for name in result.element_names]
         places = []
         for minimum in result.other_minima:
-            values = zip(symbols, minimum, strict=False)
+            values = zip(symbols, minimum, strict=True)
             places.append(", ".join(f"{symbol} = {x:.3g}" for symbol, x in values))
         yield (
-            f"-2 ln L has another, equally good minimum at {' and at '.join(places)}: {data} {do} "
-            "not distinguish them"
+            f"-2 ln L has another minimum that is nearly as good, at {' and at '.join(places)}: "
+            f"{data} {do} not distinguish them"
         )

@@ -3,6 +3,7 @@
 The alternative is gradient descent (`jaxgran.fitting.descent`).
 """
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -267,14 +268,20 @@ def _with_last_step(objective: Objective, end: np.ndarray, step: NewtonStep) -> 
 def minima_from_starts(
     problem: Problem, first: np.ndarray, max_steps: int, search: Minimiser = minimise
 ) -> list[Minimum]:
-    """Search from a first guess and, if beta_t is free, also with other values of beta_t."""
-    starts = [first]
+    """Search from a first guess and, if beta_t is free, also with other values of beta_t.
+
+    Of these a search that raises RuntimeError, as a descent that diverges, is left out.
+    """
+    minima = [search(problem, first, max_steps)]
     domains = {u.name: u.domain for u in problem.unknowns}
-    if MULTIMODAL_PARAMETER in domains:
-        names = problem.per_element([u.name for u in problem.unknowns])
-        values = domains[MULTIMODAL_PARAMETER].to_free(np.asarray(MULTIMODAL_STARTS))
-        starts += [np.where(names == MULTIMODAL_PARAMETER, x, first) for x in values]
-    return [search(problem, start, max_steps) for start in starts]
+    if MULTIMODAL_PARAMETER not in domains:
+        return minima
+    names = problem.per_element([u.name for u in problem.unknowns])
+    for value in domains[MULTIMODAL_PARAMETER].to_free(np.asarray(MULTIMODAL_STARTS)):
+        start = np.where(names == MULTIMODAL_PARAMETER, value, first)
+        with contextlib.suppress(RuntimeError):
+            minima.append(search(problem, start, max_steps))
+    return minima
 
 
 def deepest(minima: list[Minimum]) -> Minimum:

@@ -6,6 +6,7 @@ import numpy as np
 import scipy  # which imports scipy.stats at its first use
 
 from jaxgran.data.drop_test import DropTest
+from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.alternatives import Alternative
 from jaxgran.fitting.goodness import SIGNIFICANCE
 from jaxgran.fitting.headline import MAX_RATIO, describe_range, first_range, unit_after_number
@@ -114,7 +115,7 @@ def verdict(
     data, _ = data_and_verb(result)
     symbol = symbol_of(result.names[0])
     remedy = limitations[0].remedy if limitations else ""
-    edge = "The scene is at the edge of the model's validity." if limitations else ""
+    edge = "The model is not tested for all of this scene: see the reasons." if limitations else ""
     preferred = [alternative for alternative in result.alternatives if alternative.preferred]
     if misfit.is_significant or preferred:
         words = f"{model_is} not consistent with {data}: do not trust the estimates."
@@ -164,7 +165,7 @@ def _doubt(result: Fit, not_computed: tuple[str, ...]) -> str | None:
     """Return why the first parameter is not determined; None if nothing is known against it."""
     if len(result.other_minima):
         data, _ = data_and_verb(result)
-        return f"other values of the parameters fit {data} equally well"
+        return f"other values of the parameters fit {data} nearly as well"
     if result.names[0] in result.undetermined:
         return why_undetermined(result.undetermined)
     if not result.ranges:
@@ -177,7 +178,9 @@ def _doubt(result: Fit, not_computed: tuple[str, ...]) -> str | None:
         simplest = min(possible, key=lambda alternative: alternative.num_parts)
         return f"{simplest.name} cannot be excluded; over all explanations {span}"
     if not_computed:
-        return f"{not_computed[0]} could not be computed; over all other explanations {span}"
+        return (
+            f"{not_computed[0]} could not be computed, and may widen the range; without it {span}"
+        )
     return span if low >= 0 and high > MAX_RATIO * low else None
 
 
@@ -185,7 +188,7 @@ def why_undetermined(group: tuple[str, ...]) -> str:
     """Return why data do not determine parameters."""
     how = "depend only on a combination of" if len(group) > 1 else "hardly depend on"
     words = f"the computed values {how} {symbols_of(group)}"
-    if any(name.endswith("t0") for name in group):
+    if any(name.rpartition(": ")[2] == START_TIME for name in group):
         return f"{words} (a cooling gas forgets its initial temperature)"
     if {"dissipative_constant", "youngs_modulus"} <= {*group}:
         return f"{words} (in a gas of hard spheres A and Y enter only as A Y^(2/5))"
@@ -194,7 +197,8 @@ def why_undetermined(group: tuple[str, ...]) -> str:
 
 def symbols_of(group: tuple[str, ...]) -> str:
     """Return the symbols of some parameters as a list."""
-    return " and ".join(map(symbol_of, group))
+    *first, last = map(symbol_of, group)
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _who_determines(result: Fit) -> str:

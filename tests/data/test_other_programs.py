@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxgran
+from jaxgran.data.particle_frame import frame_of_columns
 
 gsd_hoomd = pytest.importorskip("gsd.hoomd")
 
@@ -220,6 +221,21 @@ def test_units_of_lammps(tmp_path, units, length, speed):
     read = jaxgran.read_particles(write(tmp_path / "a.dump", text))
     np.testing.assert_allclose(read.position[0], length * POSITION[-1], rtol=1e-14)
     np.testing.assert_allclose(read.velocity[0], speed * VELOCITY[-1], rtol=1e-14)
+
+
+def test_densities_of_lammps_in_metal_units_are_in_grams_per_cubic_centimetre():
+    names = ("x", "y", "z", "vx", "vy", "vz")
+    columns = dict(zip(names, np.hstack([POSITION[0], VELOCITY[0]]).T, strict=True))
+    columns["density"] = np.full(N, 2.5)
+    box = {"low": np.zeros(3), "sides": np.full(3, SIDE), "periodic": (True,) * 3}
+    frame = frame_of_columns(columns, **box, dimension=3, units="metal", time=None, step=None)
+    np.testing.assert_allclose(frame.equal["density"], 2500, rtol=1e-14)
+
+
+def test_scaled_positions_are_scaled_whatever_other_columns_there_are(tmp_path):
+    text = dump(names="id x xs ys zs vx vy vz", columns=(IDS, [7.0] * N))
+    read = jaxgran.read_particles(write(tmp_path / "a.dump", text), dimension=3)
+    np.testing.assert_allclose(read.position[0] / SIDE, POSITION[-1] % 1.0, rtol=1e-12)
 
 
 def test_disks_in_space_are_asked_about(tmp_path):

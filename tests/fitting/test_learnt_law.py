@@ -165,6 +165,13 @@ def test_a_law_is_learnt_from_a_curve(caplog):
         jaxgran.restitution_band(fitted(true, curve, free=("temperature",)))
 
 
+def test_a_law_is_learnt_from_impacts_alone():
+    law = jaxgran.RestitutionSpline([1e-3, 1e-2, 1e-1])
+    drops = jaxgran.DropTest([2e-3, 2e-2, 8e-2], [0.9, 0.85, 0.8], [0.01] * 3)
+    result = jaxgran.fit(jaxgran.Measurement(gas_of(law), drops), free="law", progress=False)
+    assert result.converged
+
+
 @pytest.mark.minutes
 @pytest.mark.slow  # compiles derivatives of runs
 def test_a_law_is_learnt_through_simulations():

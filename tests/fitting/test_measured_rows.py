@@ -54,6 +54,13 @@ def test_the_error_of_tracked_grains_is_in_the_budget():
     assert result.error_budget["sampling"][0] > 0.5 * errors[1]
 
 
+def test_the_sampling_of_spins_is_an_error_of_T_rot():
+    known = {"rotational_temperature": 0.1 * T, "num_particles": 1000, "tracked": 50}
+    rows = rows_of(rough_beads(), **known)
+    np.testing.assert_allclose(rows.errors[:, 1], 0.1 * T * (2 / 3 / 50 * 0.95) ** 0.5)
+    assert np.all(rows.errors[:, 0] == 0)  # the filter knows the sampling of T
+
+
 def test_plans_keep_the_start_of_a_late_clock():
     t0 = 100 * float(GAS.mean_free_time)
     late = dataclasses.replace(CURVE, times=CURVE.times + t0)
