@@ -10,7 +10,8 @@
 - `header`: the gas that the header of a file describes, with `header_elements`, and
   `measurement_header` the rest. `header_keys` lists the keys; `header_lines`, `header_values`,
   `units` and `written_numbers` read their values.
-- `questions`: all questions about unusual data; `usual_values` and `curve_questions` choose them.
+- `usual_values`, `curve_questions`: questions about unusual data, which name the value, what is
+  usual, and what would make it usual. The readers warn by them, and use the values as they are.
 - `tracks`: T(t) from positions in frames (`track_positions`, `displacements`, `velocity_memory`).
 - `track_impacts`: impacts from tracks, in the steps `motion`, `encounters`, `flights`, `contacts`.
 - `particle_file` reads files of particles, frame by frame (`particle_frame`), and

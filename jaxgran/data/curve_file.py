@@ -25,7 +25,6 @@ from jaxgran.data.drop_test_file import drop_test_columns, drop_test_of_table, i
 from jaxgran.data.header import checked_header, gas_or_none, missing_keys
 from jaxgran.data.header_lines import header_entry, header_in_si, text_of_comment
 from jaxgran.data.quantities import QUANTITIES
-from jaxgran.data.questions import ask
 from jaxgran.data.tables import Table, read_table
 from jaxgran.data.track_positions import IDENTITIES, track_columns
 from jaxgran.data.tracks import curve_of_tracks
@@ -138,7 +137,7 @@ def _content_of_tracks(table: Table) -> Content:
     content = _content_of_curve(tracked.curve, tracked.header)
     questions = list(tracked.questions)
     if table.num_left_out:
-        questions.append(ask("no track", number=table.num_left_out))
+        questions.append(f"{table.num_left_out} positions that belong to no track are left out")
     return content._replace(questions=questions + content.questions)
 
 

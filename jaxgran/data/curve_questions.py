@@ -12,7 +12,6 @@ from jaxgran.data.curve import MIN_POINTS, CoolingCurve, above_noise
 from jaxgran.data.definitions import facts_of, other_definitions
 from jaxgran.data.header_values import header_count, header_number
 from jaxgran.data.quantities import QUANTITIES
-from jaxgran.data.questions import ask, part
 from jaxgran.data.units import unit_in
 from jaxgran.data.usual_values import OTHER_UNITS, is_usual, unit_question
 from jaxgran.scene.gas import Gas
@@ -48,14 +47,18 @@ def ask_about_columns(
         column: from which T was read.
     """
     if column == "mean_speed" and facts_of(header).d == 3:
-        yield ask("mean_speed")
+        yield (
+            "mean_speed is read as the speed in three dimensions. If it contains only the two "
+            "components that one camera sees, T is 0.62 of the true one and A 37 % too large: name "
+            "the column mean_speed_xy then, and mean_speed_xyz otherwise"
+        )
     yield from _ask_about_digits(curve, rounding or {})
     for quantity in QUANTITIES.values():
         values = getattr(curve, quantity.field)
         if quantity.measured and values is not None and not quantity.column.endswith("_err"):
             largest = float(np.max(np.asarray(values)))
             if largest > 0 and not is_usual(quantity.column, largest):
-                yield unit_question(quantity.column, largest, "unit of a column")
+                yield unit_question(quantity.column, largest, is_column=True)
     if gas is None or gas.drive is not None:
         return
     if not all(is_usual(key, float(header[key])) for key in REQUIRED if key in header):
@@ -77,7 +80,11 @@ def _ask_about_digits(curve: CoolingCurve, rounding: dict[str, np.ndarray]) -> I
         coarse = given & (np.asarray(errors) < digit / sqrt(12))
         if np.sum(coarse) > np.sum(given) / 2:
             i = int(np.argmax(coarse))
-            yield ask("digits", column=column, error=errors[i], digit=digit[i])
+            yield (
+                f"{column}_err = {errors[i]:.2g} is smaller than the rounding error of {column} "
+                f"(its last digit, {digit[i]:.2g}, over sqrt(12); both in SI). The fit adds the "
+                f"rounding error. Write more digits of {column}"
+            )
 
 
 def _ask_about_errors(
@@ -87,13 +94,14 @@ def _ask_about_errors(
     rows = above_noise(curve)
     share = np.asarray(curve.temperature_error)[rows] / np.asarray(curve.temperature)[rows]
     expected = sqrt(2 / (dimension * number * replicas))
-    too_large = share[1:].min() / expected
-    too_small = expected / share.max()
-    run = {"number": number, "replicas": replicas}
-    if too_large > MAX_ERROR_RATIO:
-        yield ask("T_err and N", comparison=part("larger", ratio=too_large), **run)
-    if too_small > MAX_ERROR_RATIO:
-        yield ask("T_err and N", comparison=part("smaller", ratio=too_small), **run)
+    ratios = {"larger": share[1:].min() / expected, "smaller": expected / share.max()}
+    for comparison, ratio in ratios.items():
+        if ratio > MAX_ERROR_RATIO:
+            yield (
+                f"T_err is at least {ratio:.2g} times {comparison} than the scatter of T of N = "
+                f"{number:g} particles in {replicas:g} run(s): do N, replicas and T_err belong to "
+                "this curve, and is T_err a standard error of the mean?"
+            )
 
 
 class _StartLine(NamedTuple):
@@ -158,7 +166,11 @@ def _ask_about_start(
     if line.ratio > max_ratio:
         yield _scale_question(line.ratio, gas, header, column)
     elif begin > MAX_LATENESS * line.halving_time and begin > 0.5 * times[0]:
-        yield ask("late start", T0=T0, begin=begin)
+        yield (
+            f"by the first rows, extrapolated, T is T0 = {T0:g} m^2/s^2 at t = {begin:.6g} s, not "
+            "at t = 0: did the clock start before the gas began to cool? Then subtract this time "
+            "from t, or fit it: --free A t0"
+        )
     elif line.ratio_at_zero < 1 / max_ratio:
         yield _scale_question(line.ratio_at_zero, gas, header, column)
     if T[-1] < 0.8 * T[0]:
@@ -172,14 +184,17 @@ def _ask_about_loss(line: _StartLine, gas: Gas) -> Iterator[str]:
     if USUAL_LOSS[0] <= loss <= USUAL_LOSS[1]:
         return
     units = [unit for unit in OTHER_UNITS["s"] if 1e-3 < loss / unit_in(unit, "s") < 1]
-    question = part("any unit of the header")
+    question = "are t, eta, diameter and T0 in the units that the file says?"
     if units:
-        question = part("unit of t", units=" or ".join(units), unit=units[0])
+        question = f"is t in {' or '.join(units)}? Then name the column t ({units[0]})."
     if loss < 1:
-        question += part("steps")
+        question += " Or is t counted in steps or frames? Then multiply t by the duration of one"
     halving = line.halving_time / float(gas.mean_free_time)
     high, low = (halving * loss / usual for usual in USUAL_LOSS)
-    yield ask("loss", halving=halving, low=low, high=high, question=question)
+    yield (
+        f"T falls to a half in {halving:.3g} mean free times of the header's gas (eta, diameter, "
+        f"T0), where usual values are {low:.2g} to {high:.2g}: {question}"
+    )
 
 
 @eqx.filter_jit
@@ -195,10 +210,16 @@ def _scale_question(ratio: float, gas: Gas, header: dict[str, str], column: str)
     T0 = float(gas.temperature)
     causes = []
     for definition, factor in other_definitions(ratio, column, facts_of(header)):
-        rename = part("rename", column=definition.column) if definition.column else ""
+        rename = f"name the column {definition.column}, or " if definition.column else ""
         what = "it" if definition.power == 1 else "T"
         causes.append(
-            part("definition", words=definition.words, rename=rename, what=what, factor=factor)
+            f"is the column {definition.words}? Then {rename}multiply {what} by {factor:.6g}"
         )
-    question = ". Or ".join(causes) or part("any definition")
-    return ask("scale", first=ratio * T0, ratio=ratio, T0=T0, question=question)
+    question = ". Or ".join(causes) or (
+        "are T and T0 both <v^2>/d, averaged over the grains, in m^2/s^2? (Not in kelvin, not the "
+        "energy of all N grains, not T over its first value)"
+    )
+    return (
+        f"T is {ratio * T0:.4g} at first, {ratio:.3g} times the header's T0 = {T0:g} m^2/s^2: "
+        f"{question}. If T is right, correct T0"
+    )

@@ -12,7 +12,6 @@ from jaxtyping import Float
 
 from jaxgran.data.drop_test import PARTNERS, DropTest
 from jaxgran.data.header_values import header_number
-from jaxgran.data.questions import ask
 from jaxgran.data.tables import Table
 
 RESTITUTION = ("eps", "eps_err")
@@ -223,7 +222,10 @@ def _ask_about_sign(name: str, value: np.ndarray, obliqueness: np.ndarray) -> li
     trend = scipy.stats.kendalltau(obliqueness, value, alternative="less")
     if not trend.pvalue < SIGN_LEVEL:
         return []
-    return [ask("sign of eps_t", name=name)]
+    return [
+        f"{name} falls as impacts become more grazing, and Coulomb's law makes it rise to 1: is it "
+        f"beta_t = -{name}? Then change its sign"
+    ]
 
 
 def _of_velocities(table: Table, onto: str) -> DropTest:

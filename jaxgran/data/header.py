@@ -16,7 +16,6 @@ from jaxgran.data.header_keys import (
     VISCOELASTIC_KEYS,
 )
 from jaxgran.data.header_values import header_dimension, header_number, header_sides
-from jaxgran.data.questions import ask
 from jaxgran.data.units import UNIT_KEYS
 from jaxgran.data.usual_values import ask_about_header
 from jaxgran.scene.elements import VOLUME_TOLERANCE, container_volume_ratio
@@ -92,7 +91,10 @@ def ask_about_another_gas(header: dict[str, str], gas: Gas) -> list[str]:
         given = header_number(header, key)
         used = float(sphere[name])
         if abs(given - used) > MAX_DIFFERENCE * abs(used):
-            questions.append(ask("another gas", key=key, given=given, used=used))
+            questions.append(
+                f"{key} is {given:g} in this header, but {used:.4g} in the gas that is used: "
+                "impacts of other spheres need a header of all of them, read without this gas"
+            )
     return questions
 
 
@@ -102,7 +104,10 @@ def _ask_about_unknown_keys(header: dict[str, str]) -> Iterator[str]:
     # Comments that are no single word are not keys.
     unknown = [key for key in header if key.isidentifier() and key not in others]
     if unknown:
-        yield ask("unknown keys", unknown=", ".join(unknown), known=", ".join(known))
+        yield (
+            f"ignoring unknown header keys: {', '.join(unknown)}. Known keys are "
+            f"{', '.join(known)}, and errors such as eta_err"
+        )
 
 
 def gas_or_none(header: dict[str, str]) -> Gas | None:

@@ -12,7 +12,6 @@ from jaxgran.data.curve import MIN_POINTS, CoolingCurve, from_arrays
 from jaxgran.data.curve_checks import check_values
 from jaxgran.data.displacements import CHANCE, MIN_TRACKS, Step, steps_of_tracks
 from jaxgran.data.header_values import header_count, header_dimension, header_number
-from jaxgran.data.questions import ask
 from jaxgran.data.track_positions import identities_of
 from jaxgran.data.velocity_memory import NUM_ITERATIONS, Memory, displacement_factor, fit_memory
 from jaxgran.scene.gas import Gas
@@ -178,7 +177,10 @@ def _check_identities(
     remarks.notes.append(f"{percent:+.2g} % from T by the median of the speeds")
     _check_left_out(steps, header, remarks)
     if abs(np.log1p(difference)) > 3 * chance + MAX_SONINE:
-        remarks.questions.append(ask("median", percent=percent))
+        remarks.questions.append(
+            f"T by the mean square of the speeds is {percent:+.2g} % from T by their median: "
+            "identities may be wrong, or the gas may consist of unequal parts"
+        )
 
 
 def _check_left_out(steps: list[Step], header: dict[str, str], remarks: _Remarks) -> None:
@@ -199,7 +201,8 @@ def _check_left_out(steps: list[Step], header: dict[str, str], remarks: _Remarks
     remarks.notes.append(left_out)
     if too_long > 1 + MAX_TAIL * CHANCE * len(steps) or exchanged > MAX_SWAPPED * total:
         remarks.questions.append(
-            ask("identities", left_out=left_out, too_long=too_long, swapped=exchanged)
+            f"{left_out}: {too_long} are longer than the distribution of speeds allows, and "
+            f"{exchanged} shorter if two particles exchange their identities; check the tracks"
         )
 
 
@@ -240,10 +243,14 @@ def _memory(
     memory = fit_memory(steps, T, enskog, localisation_error)
     estimated = memory.localisation_error
     if estimated is not None:
-        remarks.notes.append(f"localisation_error not given, and estimated as {estimated:.2g} m")
-        remarks.questions.append(ask("unknown localisation", error=estimated))
+        note = f"localisation_error not given, and estimated as {estimated:.2g} m"
+        remarks.notes.append(note)
+        remarks.questions.append(f"{note}; measure it and add it to the header")
     if memory.rate_ratio is not None and abs(memory.rate_ratio - 1) > MAX_RATE_ERROR:
-        remarks.questions.append(ask("rate", ratio=memory.rate_ratio))
+        remarks.questions.append(
+            f"velocities change {memory.rate_ratio:.2g} times as fast as impacts at this eta and "
+            "diameter change them: check these and the tracks"
+        )
     return memory
 
 
@@ -268,7 +275,10 @@ def _without_localisation_error(
     share = float(np.max(added / T))
     remarks.notes.append(f"localisation_error removed, at most {100 * share:.2g} % of T")
     if share > MAX_CORRECTION:
-        remarks.questions.append(ask("localisation", percent=100 * share))
+        remarks.questions.append(
+            f"localisation_error adds up to {100 * share:.2g} % to T, too much for an accurate "
+            "correction: leave out the last frames"
+        )
     return T - added
 
 
@@ -295,5 +305,8 @@ def _without_impacts(
     share = float(np.max(1 - T / true))
     remarks.notes.append(f"impacts between frames corrected, at most {100 * share:.2g} % of T")
     if share > MAX_CORRECTION:
-        remarks.questions.append(ask("impacts", percent=100 * share))
+        remarks.questions.append(
+            f"impacts between frames take up to {100 * share:.2g} % from T, too much for an "
+            "accurate correction: use frames closer together"
+        )
     return true

@@ -4,7 +4,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jaxgran.data.questions import ask, part
 from jaxgran.data.units import UNITS, unit_in
 
 SPEEDS = {"v", "v_n", "v_t", "vx", "vy", "vz"}
@@ -46,19 +45,26 @@ def ask_about_header(values: dict[str, float]) -> Iterator[str]:
     """Yield questions about unusual values of header keys, in SI."""
     for key, value in values.items():
         if not is_usual(key, value):
-            yield unit_question(key, value, "unit of a key")
+            yield unit_question(key, value, is_column=False)
         error = values.get(f"{key}_err", 0.0)
         if key == "T0" and value == 1:
-            yield ask("T0 is 1")
-        if key != "t0" and error > value > 0:
-            unit = UNITS[key]
-            yield ask(
-                "large error of a number" if unit == "1" else "large error",
-                key=key,
-                error=error,
-                unit=unit,
-                value=value,
+            yield (
+                "T0 is 1 m^2/s^2: is the temperature divided by its first value? Then give T0 in "
+                "m^2/s^2, and multiply T by it"
             )
+        if key != "t0" and error > value > 0:
+            yield _error_question(key, value, error)
+
+
+def _error_question(key: str, value: float, error: float) -> str:
+    """Return the question on an error that is larger than its value."""
+    unit = UNITS[key]
+    if unit == "1":
+        return f"{key}_err is {error:.6g}, larger than {key} itself, {value:.6g}: check it"
+    return (
+        f"{key}_err is {error:.6g} {unit}, larger than {key} itself, {value:.6g} {unit}: an error "
+        f"without a unit is read in the unit of {key}. If it is in {unit}, write {unit} after it"
+    )
 
 
 def ask_about_speeds(columns: dict[str, np.ndarray]) -> Iterator[str]:
@@ -66,26 +72,31 @@ def ask_about_speeds(columns: dict[str, np.ndarray]) -> Iterator[str]:
     for name in sorted(SPEEDS & columns.keys()):
         largest = float(np.max(np.abs(columns[name])))
         if not is_usual(name, largest):
-            yield unit_question(name, largest, "unit of a column")
+            yield unit_question(name, largest, is_column=True)
 
 
-def unit_question(name: str, value: float, advice: str) -> str:
+def unit_question(name: str, value: float, *, is_column: bool) -> str:
     """Return the question on an unusual value, with the unit in which it would be usual.
 
     Args:
         name: of a header key or a column.
         value: in SI.
-        advice: the name in `PARTS` of what to write if such a unit is found.
+        is_column: where a unit is written: after the name of a column, or after a value.
     """
     low, high = USUAL_RANGES[name]
     base = UNITS[name]
-    question = part("any unit of T" if base == "m^2/s^2" else "any unit")
+    question = "check its unit"
+    if base == "m^2/s^2":
+        question += " (kelvin times 1.38e-23 J/K over the mass are m^2/s^2)"
     for unit in OTHER_UNITS[base]:
         in_si = unit_in(unit, base) * value
         if is_usual(name, in_si):
-            question = part(advice, name=name, unit=unit, value=value, in_si=in_si)
+            advice = f"{name}: {in_si:.6g}, or {name}: {value:g} {unit}"
+            if is_column:
+                advice = f"{name} ({unit}) as the name of the column"
+            question = f"is it in {unit}? Then write {advice}"
             break
-    return ask("unusual", name=name, value=value, base=base, low=low, high=high, question=question)
+    return f"{name} is {value:.6g} {base}, where usual values are {low:g} to {high:g}: {question}"
 
 
 def is_usual(name: str, value: float) -> bool:

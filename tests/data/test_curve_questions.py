@@ -1,15 +1,11 @@
 """Questions about files whose header and columns contradict each other."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-import jaxgran
 from jaxgran import read_measurement
-from jaxgran.data.questions import PARTS, QUESTIONS
-from tests.calls import literal_arguments
 from tests.data.curve_files import GAS, SPEED_XY, TIMES, T, said, text_of
 
 QUESTIONED = {
@@ -70,9 +66,3 @@ def test_speeds_of_drop_tests_are_asked_about(tmp_path):
     (tmp_path / "drops.csv").write_text("v,eps,eps_err\n10,0.92,0.01\n100,0.9,0.01\n")
     with pytest.warns(UserWarning, match="v is 100 m/s, .*0 to 8: .*cm/s"):
         read_measurement(tmp_path / "drops.csv", gas=GAS)
-
-
-def test_each_question_and_part_is_used_and_each_used_one_exists():
-    used = literal_arguments(Path(jaxgran.__file__).parent.glob("data/*.py"))
-    assert used["ask"] == {*QUESTIONS}
-    assert used["part"] | used["unit_question"] == {*PARTS}
