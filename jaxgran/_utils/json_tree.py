@@ -83,8 +83,8 @@ def from_json(value: Any) -> Any:
 
 def _field_names(cls: type) -> list[str] | None:
     """Return the names of the fields of a named tuple or a dataclass; None for other classes."""
-    if issubclass(cls, tuple) and hasattr(cls, "_fields"):
-        return list(cls._fields)
+    if issubclass(cls, tuple) and (names := getattr(cls, "_fields", None)) is not None:
+        return list(names)
     if dataclasses.is_dataclass(cls):
         return [f.name for f in dataclasses.fields(cls)]
     return None
