@@ -2,6 +2,7 @@
 
 import dataclasses
 from importlib import import_module
+from operator import attrgetter
 from typing import Any
 
 import jax
@@ -16,21 +17,26 @@ class NotStorable(ValueError):
 
 
 def to_json(value: Any) -> Any:
-    """Return a tree of objects as JSON takes it; `from_json` is the inverse.
+    """Return a tree of objects as JSON takes it, of which `from_json` makes equal objects.
+
+    Single numbers and booleans of NumPy come back as those of Python.
 
     Raises:
-        NotStorable: for an object that is not of this package, an array, a number or a text.
+        NotStorable: for an object that is not of this package, an array, a number or a text, and
+            for complex numbers.
 
     >>> from jaxgran._utils.json_tree import from_json, to_json
     >>> from_json(to_json((1.5, float("inf"), {"a": np.arange(2)})))
     (1.5, inf, {'a': array([0, 1])})
     """
+    # Numbers of NumPy come before those of Python, since np.float64 is a float, and named tuples
+    # before tuples.
+    if isinstance(value, np.generic):
+        return to_json(value.item())
     if value is None or isinstance(value, str | bool | int):
         return value
     if isinstance(value, float):
         return value if np.isfinite(value) else {"float": repr(value)}
-    if isinstance(value, np.generic):
-        return to_json(value.item())
     if isinstance(value, np.ndarray | jax.Array):
         array = np.asarray(value)
         kind = "jax" if isinstance(value, jax.Array) else "numpy"
@@ -40,7 +46,7 @@ def to_json(value: Any) -> Any:
         return {"dict": [[to_json(key), to_json(part)] for key, part in value.items()]}
     if isinstance(value, list):
         return [to_json(part) for part in value]
-    names = _field_names(value)
+    names = _field_names(type(value))
     if names is not None:
         module = type(value).__module__
         if not module.startswith(f"{PACKAGE}."):
@@ -56,7 +62,7 @@ def from_json(value: Any) -> Any:
     """Return the tree of objects that `to_json` stored.
 
     Raises:
-        ValueError: for a class that is not of this package.
+        ValueError: for a class that is not of this package, or whose fields are not those stored.
     """
     if isinstance(value, list):
         return [from_json(part) for part in value]
@@ -75,12 +81,12 @@ def from_json(value: Any) -> Any:
     return _made(value["class"], {name: from_json(x) for name, x in value["fields"].items()})
 
 
-def _field_names(value: Any) -> list[str] | None:
-    """Return the names of the fields of a named tuple or a dataclass; None for other objects."""
-    if isinstance(value, tuple) and (names := getattr(value, "_fields", None)) is not None:
+def _field_names(cls: type) -> list[str] | None:
+    """Return the names of the fields of a named tuple or a dataclass; None for other classes."""
+    if issubclass(cls, tuple) and (names := getattr(cls, "_fields", None)) is not None:
         return list(names)
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return [f.name for f in dataclasses.fields(value)]
+    if dataclasses.is_dataclass(cls):
+        return [f.name for f in dataclasses.fields(cls)]
     return None
 
 
@@ -89,7 +95,13 @@ def _made(place: str, fields: dict[str, Any]) -> Any:
     module, _, name = place.partition(":")
     if not module.startswith(f"{PACKAGE}."):
         raise ValueError(f"{place} is not a class of {PACKAGE}")
-    cls: Any = getattr(import_module(module), name)
+    cls: Any = attrgetter(name)(import_module(module))
+    names = _field_names(cls) or []
+    if fields.keys() != {*names}:
+        raise ValueError(
+            f"another version of {PACKAGE} stored this {name}: it has the fields "
+            f"{', '.join(fields)}, and now {', '.join(names)}"
+        )
     if issubclass(cls, tuple):
         return cls(**fields)
     made = object.__new__(cls)

@@ -18,7 +18,7 @@ from jaxgran.cli.page import command_of, question_of, sections_of_plan, write_pa
 from jaxgran.cli.scene import has_dissipation, read_toml
 from jaxgran.data.files import check_writable, name_in_errors, write_atomically
 from jaxgran.data.measurement_header import arguments_of_header
-from jaxgran.data.scene_file import errors_of, times_of
+from jaxgran.data.scene_file import EXPERIMENT, HOW_TO_GIVE_TIMES
 from jaxgran.fitting.twins import twin
 
 
@@ -91,12 +91,13 @@ def read_experiment(path: Path) -> jaxgran.Measurement:
     file = read_toml(path)
     if not has_dissipation(file.header):
         raise ValueError("a plan needs a guess of A, in s, or of eps: add one")
-    errors = errors_of(file.experiment)
+    if file.experiment is None:
+        raise ValueError(f"a plan needs a table [{EXPERIMENT}] with {HOW_TO_GIVE_TIMES}")
+    times, errors = file.experiment
     if "rotational_temperature" in errors and file.gas.surface is None:
         raise ValueError("T_rot_err needs rough grains: give beta_t, or leave out T_rot_err")
     if "displacement" in errors and file.gas.container is not None:
         raise ValueError("msd_err: <dr^2> is not computed between walls. Leave out msd_err")
-    times = times_of(file.experiment)
     ones = np.ones_like(times)
     planned: dict[str, Any] = {"times": times, "temperature": ones}
     for name, error in errors.items():

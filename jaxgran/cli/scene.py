@@ -3,7 +3,6 @@
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -13,7 +12,7 @@ from jaxgran.data.files import name_in_errors
 from jaxgran.data.header import gas_of_header
 from jaxgran.data.header_values import header_count, header_number
 from jaxgran.data.measurement_header import guesses_of_header
-from jaxgran.data.scene_file import read_scene_file
+from jaxgran.data.scene_file import Experiment, read_scene_file
 from jaxgran.scene.elements import container_volume_ratio
 from jaxgran.scene.parameters import symbol_of
 
@@ -45,12 +44,12 @@ class SceneFile:
     Attributes:
         gas: the gas.
         header: entries of the scene, in SI.
-        experiment: entries of the table [experiment]; {} without one.
+        experiment: the planned experiment; None without a table [experiment].
     """
 
     gas: jaxgran.Gas
     header: dict[str, str]
-    experiment: dict[str, Any]
+    experiment: Experiment | None
 
 
 def read_scene(path: Path, until: float | None, *, fits_A: bool = False) -> Scene:

@@ -29,7 +29,7 @@ TOLERANCE = 1e-12
 """Largest relative difference of the sides of a box that is read as a cube."""
 
 GSD_DEFAULT = 1.0
-"""Diameter, m, and mass, kg, of GSD files that give none."""
+"""Diameter and mass that `gsd` returns for files that give none."""
 
 DATA_COLUMNS = {
     "atomic": ("id", "type", "x", "y", "z"),
@@ -50,6 +50,10 @@ XYZ_VECTORS = {
 DUMP_ITEMS = ("UNITS", "TIMESTEP", "TIME", "NUMBER OF ATOMS", "BOX BOUNDS", "ATOMS")
 
 SLANTED = "its box is slanted; only rectangular boxes are supported"
+"""Message."""
+
+FrameReader = Callable[[int | None], Frame]
+"""A function that reads a frame, given its dimension or None."""
 
 
 def read_particles(path: str | Path, *, frame: int = -1, dimension: int | None = None) -> Particles:
@@ -105,24 +109,22 @@ def read_particles(path: str | Path, *, frame: int = -1, dimension: int | None =
     )
 
 
-def open_frames(path: Path) -> list[Callable[[int | None], Frame]]:
-    """Return a function for each frame of a file, which reads it, given its dimension or None."""
+def open_frames(path: Path) -> list[FrameReader]:
+    """Return a function for each frame of a file, which reads it."""
     if path.suffix == GSD:
         with import_gsd().open(str(path), "r") as file:
             return [partial(_read_gsd, path, k) for k in range(len(file))]
     text = read_bytes(path).decode("utf-8-sig")
+    frames: list[FrameReader]
     if text.lstrip().startswith("ITEM:"):
-        read = _read_dump
-        parts = _parts_of_dump(text)
-    elif text.split(maxsplit=1)[:1] and text.split(maxsplit=1)[0].isdigit():
-        read = _read_xyz
-        parts = _parts_of_xyz(text)
+        frames = [partial(_read_dump, part) for part in _parts_of_dump(text)]
+    elif re.match(r"\s*\d+(\s|$)", text):
+        frames = [partial(_read_xyz, part) for part in _parts_of_xyz(text)]
     else:
         return [partial(_read_data, text)]
-    frames: list[Any] = [partial(read, part) for part in parts]
-    if not text.endswith("\n"):
-        frames[-1:] = [_refuse_cut]
-    return frames
+    if text.endswith("\n"):
+        return frames
+    return [*frames[:-1], _refuse_cut]
 
 
 def import_gsd() -> Any:
@@ -131,6 +133,7 @@ def import_gsd() -> Any:
 
 
 def _refuse_cut(dimension: int | None) -> Frame:
+    """Refuse the last frame of a text file whose last line does not end."""
     raise ValueError(
         "it ends within a line, so that its last number may be cut off: end the last line if the "
         "file is complete, or read a frame before the last one"
@@ -138,6 +141,7 @@ def _refuse_cut(dimension: int | None) -> Frame:
 
 
 def _read_gsd(path: Path, k: int, dimension: int | None) -> Frame:
+    """Return frame k of a GSD file."""
     with import_gsd().open(str(path), "r") as file:
         snapshot = file[k]
         # gsd returns the velocities of the first frame for a frame without, and 0 for the first. It
@@ -150,19 +154,28 @@ def _read_gsd(path: Path, k: int, dimension: int | None) -> Frame:
     sides, tilts = np.split(np.asarray(box.box, float), 2)
     if np.any(tilts != 0):
         raise ValueError(SLANTED)
-    spin, time = (snapshot.log.get(name) for name in ("particles/angular_velocity", "time"))
-    columns = {"type": particles.typeid, "diameter": particles.diameter}
-    if np.any(particles.mass != GSD_DEFAULT):  # otherwise it was not given
+    columns = {"type": particles.typeid}
+    if np.any(particles.diameter != GSD_DEFAULT):
+        columns["diameter"] = particles.diameter
+    if np.any(particles.mass != GSD_DEFAULT):
         columns["mass"] = particles.mass
-    columns |= zip("xyz", np.asarray(particles.position, float).T, strict=True)
+    columns |= _columns_of("xyz", particles.position)
     if known:
-        columns |= zip(VELOCITY, np.asarray(particles.velocity, float).T, strict=True)
+        columns |= _columns_of(VELOCITY, particles.velocity)
+    spin = snapshot.log.get("particles/angular_velocity")
     if spin is not None:
-        spin = np.reshape(spin, (int(particles.N), -1)).T
-        columns |= zip(SPIN[-len(spin) :], spin, strict=True)
+        spin = np.reshape(spin, (int(particles.N), -1))
+        in_plane = spin.shape[1] == 1
+        columns |= _columns_of(SPIN[-1:] if in_plane else SPIN, spin)
+    time = snapshot.log.get("time")
     time = None if time is None else float(time[0])
     dimension = dimension or int(box.dimensions)
     return frame_of_columns(columns, -sides / 2, sides, dimension, time=time, step=int(box.step))
+
+
+def _columns_of(names: Sequence[str], vectors: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the components of vectors, shape (N, d), by name."""
+    return dict(zip(names, np.asarray(vectors, float).T, strict=True))
 
 
 def _parts_of_dump(text: str) -> list[dict[str, tuple[list[str], str]]]:
@@ -180,8 +193,10 @@ def _parts_of_dump(text: str) -> list[dict[str, tuple[list[str], str]]]:
 
 
 def _read_dump(items: dict[str, tuple[list[str], str]], dimension: int | None) -> Frame:
+    """Return the frame of some items of a LAMMPS dump."""
     if not {"BOX BOUNDS", "ATOMS", "NUMBER OF ATOMS"} <= items.keys():
         raise ValueError("the frame of the LAMMPS dump is incomplete")
+    # Each axis has two letters, the boundaries at both ends; a slanted box has further words.
     flags, bounds = items["BOX BOUNDS"]
     if not all(re.fullmatch("[pfsm]{2}", flag) for flag in flags):
         raise ValueError(SLANTED)
@@ -221,6 +236,7 @@ def _parts_of_xyz(text: str) -> list[list[str]]:
 
 
 def _read_xyz(lines: list[str], dimension: int | None) -> Frame:
+    """Return the frame of some lines of an extended XYZ file."""
     head = lines[1] if len(lines) > 1 else ""
     info = dict(part.split("=", 1) for part in shlex.split(head) if "=" in part)
     info = {key.lower(): value for key, value in info.items()}
@@ -236,30 +252,37 @@ def _read_xyz(lines: list[str], dimension: int | None) -> Frame:
     parts = info["properties"].split(":")
     names: list[str] = []
     for name, number in zip(parts[::3], map(int, parts[2::3]), strict=True):
-        name = name.lower() if name.lower() in XYZ_VECTORS else name
-        several = XYZ_VECTORS.get(name, [f"{name}_{k}" for k in range(number)])
-        # In a plane the angular velocity has a z component only.
-        names += [name] if number == 1 and name not in XYZ_VECTORS else several[-number:]
+        vector = XYZ_VECTORS.get(name.lower())
+        if vector is not None:
+            names += vector[-number:]  # in a plane the angular velocity has a z component only
+        elif number == 1:
+            names.append(name)
+        else:
+            names += [f"{name}_{k}" for k in range(number)]
     if dimension is None and "dimension" in info:
         dimension = int(info["dimension"])
+    # One of T, F, true, False, 1 and 0 for each axis.
+    flags = re.findall("[TtFf01]", info.get("pbc", "TTT"))
     return frame_of_columns(
         _table([line.split() for line in lines[2:]], names, int(lines[0])),
         np.array(info.get("origin", "0 0 0").split(), float),
         np.diag(lattice),
         dimension,
         units=info.get("units", "si"),
-        periodic=tuple(x in "Tt1" for x in re.findall("[TtFf01]", info.get("pbc", "TTT"))),
+        periodic=tuple(flag in "Tt1" for flag in flags),
         time=float(info["time"]) if "time" in info else None,
     )
 
 
 def _read_data(text: str, dimension: int | None) -> Frame:
+    """Return the only frame of a LAMMPS data file."""
+    # Lines such as "0.0 0.1 xlo xhi".
     bounds = [re.search(rf"^\s*(\S+)\s+(\S+)\s+{x}lo {x}hi", text, re.MULTILINE) for x in "xyz"]
     if not all(bounds):
         raise ValueError(
             "no file of particles: give a LAMMPS dump or data file, extended XYZ, or GSD (.gsd)"
         )
-    if re.search(r"^.*(xy xz yz|avec)", text, re.MULTILINE):
+    if "xy xz yz" in text or "avec" in text:  # lines of the head that only slanted boxes have
         raise ValueError(SLANTED)
     low, high = np.array([[b[1], b[2]] for b in bounds if b], float).T
     style = re.search(r"^Atoms\s*#\s*(\w+)", text, re.MULTILINE)
@@ -270,7 +293,8 @@ def _read_data(text: str, dimension: int | None) -> Frame:
     velocities = _section(text, "Velocities", ("id", *VELOCITY, *SPIN), count)
     if np.any(atoms["id"] != velocities["id"]):
         raise ValueError("its sections Atoms and Velocities have different ids")
-    units = re.search(r"^.*units = (\w+)", text)
+    # The first line is a comment: "LAMMPS data file via write_data, ..., units = si".
+    units = re.match(r".*units = (\w+)", text)
     units = units[1] if units else "si"
     return frame_of_columns(atoms | velocities, low, high - low, dimension, units=units)
 
@@ -279,6 +303,7 @@ def _section(
     text: str, name: str, columns: tuple[str, ...], count: re.Match[str] | None
 ) -> dict[str, np.ndarray]:
     """Return the columns of a section of a LAMMPS data file, sorted by id."""
+    # The name, possibly with a comment; an empty line; lines that begin with a number.
     match = re.search(rf"^{name}\b.*\n\s*\n((?:[ \t]*[-+\d].*(?:\n|$))+)", text, re.MULTILINE)
     if match is None:
         raise ValueError(f"it has no section {name}")
@@ -290,8 +315,6 @@ def _section(
 def _table(rows: list[list[str]], names: Sequence[str], count: int) -> dict[str, np.ndarray]:
     """Return the columns of the rows of a frame, by name, as text."""
     if len(rows) != count or any(len(row) != len(names) for row in rows):
-        raise ValueError(
-            f"a frame of {count} atoms has not as many complete rows of {len(names)} columns"
-        )
+        raise ValueError(f"expected {count} rows of {len(names)} columns in a frame")
     columns = np.array(rows, object).reshape(count, len(names)).T
     return dict(zip(names, columns, strict=True))

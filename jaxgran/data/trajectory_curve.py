@@ -10,7 +10,7 @@ import numpy as np
 from jaxgran.data.curve import CoolingCurve, from_arrays
 from jaxgran.data.curve_checks import check_values
 from jaxgran.data.header_values import header_count, header_number, positive_number
-from jaxgran.data.particle_file import GSD_DEFAULT, open_frames
+from jaxgran.data.particle_file import open_frames
 from jaxgran.data.particle_frame import Frame
 from jaxgran.scene.geometry import sphere_mass
 
@@ -86,15 +86,14 @@ def _add_to_header(header: dict[str, str], frame: Frame) -> None:
     from_file: dict[str, float] = {"N": N, "dimension": d}
     if "diameter" in equal or "radius" in equal:
         sigma = float(equal["diameter"][0] if "diameter" in equal else 2 * equal["radius"][0])
-        if sigma != GSD_DEFAULT:
-            from_file["diameter"] = sigma
-            if "density" in equal:
-                from_file["density"] = float(equal["density"][0])
-            elif "mass" in equal:
-                from_file["density"] = float(equal["mass"][0] / sphere_mass(sigma, 1.0))
-            if frame.periodic:
-                volume = float(np.prod(frame.sides))
-                from_file["eta"] = N * (pi / 6 if d == 3 else pi / 4) * sigma**d / volume
+        from_file["diameter"] = sigma
+        if "density" in equal:
+            from_file["density"] = float(equal["density"][0])
+        elif "mass" in equal:
+            from_file["density"] = float(equal["mass"][0] / sphere_mass(sigma, 1.0))
+        if frame.periodic:
+            volume = float(np.prod(frame.sides))
+            from_file["eta"] = N * (pi / 6 if d == 3 else pi / 4) * sigma**d / volume
     for key, value in from_file.items():
         tolerance = 0.0 if key in ("N", "dimension") else HEADER_TOLERANCE
         if abs(header_number(header, key) - value if key in header else 0.0) > tolerance * value:

@@ -8,7 +8,8 @@
   residuals, the `innovations` by a Kalman filter (`kalman`); `likelihood`: the public function of
   the gas.
 - `search`: the maximum of the likelihood; `simulations`: the same for stochastic models,
-  `simulated_errors` the errors of its estimate, and `simulated_fit` its result.
+  `simulated_errors` the errors of its estimate, some of them by `prior_effects`, and
+  `simulated_fit` its result.
 - `estimate`: the searches of a fit and the tests of what they found; `assemble`: its numbers, with
   errors by cause (`information`); `result`: the class `Fit`.
 - `goodness`, `outliers`: tests of the fit, and far values.

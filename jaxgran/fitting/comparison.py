@@ -17,7 +17,17 @@ from jaxgran.fitting.innovations import Innovations, innovations
 from jaxgran.fitting.kalman import Nodes, filtered
 from jaxgran.fitting.parameters import with_parameters
 from jaxgran.fitting.prediction import Element, PredictedCurve, Prediction, diffusive_share
-from jaxgran.fitting.rows import DISPLACEMENT, Displacement, Noise, Observed
+from jaxgran.fitting.rows import (
+    DISPLACEMENT,
+    FEW_PARTICLES,
+    MEASUREMENT,
+    MODEL,
+    SAMPLING,
+    SIMULATION,
+    Displacement,
+    Noise,
+    Observed,
+)
 from jaxgran.scene.gas import Gas
 
 DIFFERENCE = float(np.finfo(float).eps ** 0.25)
@@ -178,21 +188,21 @@ class Comparison:
     @property
     def _error_factor(self) -> float:
         """Factor of the errors of the measurement."""
-        return self.sources.get("measurement", 1.0) ** 0.5
+        return self.sources.get(MEASUREMENT, 1.0) ** 0.5
 
     def _observed(self) -> Observed:
         curve = self.curve
         observed = curve.rows.at_nodes(curve.times.size, curve.place, self._error_factor)
-        simulation = self.sources.get("simulation", 1.0) * observed.simulation
+        simulation = self.sources.get(SIMULATION, 1.0) * observed.simulation
         return observed._replace(simulation=simulation)
 
     def _noise(self, log_scatter: Any, white: Any = 0.0) -> Noise:
         curve = self.curve
-        few_particles = self.sources.get("few particles", 1.0)
+        few_particles = self.sources.get(FEW_PARTICLES, 1.0)
         of_number = few_particles * np.exp(log_scatter)
-        factor = self.sources.get("model", 1.0) ** 0.5
+        factor = self.sources.get(MODEL, 1.0) ** 0.5
         noise = curve.rows.noise(curve.times, of_number, white, factor)
-        return noise._replace(sample=self.sources.get("sampling", 1.0) * noise.sample)
+        return noise._replace(sample=self.sources.get(SAMPLING, 1.0) * noise.sample)
 
 
 def _nodes(curve: PredictedCurve, batch: Prediction, gas: Gas) -> Nodes:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from jaxgran.fitting.comparison import Residuals
 from jaxgran.fitting.problem import Evaluation, Problem
-from jaxgran.fitting.rows import SCATTER
+from jaxgran.fitting.rows import FEW_PARTICLES, MEASUREMENT, MODEL, SAMPLING, SCATTER, SIMULATION
 from jaxgran.fitting.search import Minimum, Solution
 from jaxgran.scene.laws import RestitutionLaw
 from jaxgran.scene.parameter_fields import law_fields
@@ -29,12 +29,6 @@ MIN_EIGENVALUE = 1e-12
 MIN_SHARE = 0.05
 """Share of a parameter in an undetermined combination, over the largest share, from which the
 parameter is itself undetermined."""
-
-FEW_PARTICLES = "few particles"
-"""Part of an error by the randomness of collisions of N grains."""
-
-SAMPLING = "sampling"
-"""Part of an error by T of some tracked grains in place of all."""
 
 
 def inverse(information: np.ndarray) -> np.ndarray:
@@ -66,11 +60,11 @@ def _sources_of_curves(problem: Problem) -> list[str]:
     """Return the causes of the scatter of the measured curves about theory."""
     if not problem.curves:
         return []
-    sources = ["measurement", FEW_PARTICLES, "model"]
+    sources = [MEASUREMENT, FEW_PARTICLES, MODEL]
     if any(m.grains.sample > 0 for m in problem.curves):
         sources.append(SAMPLING)
     if any(np.any(np.asarray(m.simulation) > 0) for m in problem.curves):
-        sources.append("simulation")
+        sources.append(SIMULATION)
     return sources
 
 
@@ -86,7 +80,7 @@ def _information_of_curves(
 def _source_of(row: Residuals) -> str:
     """Return the cause of the error of residuals other than those of T and T_rot."""
     if not row.is_prior:
-        return "measurement"
+        return MEASUREMENT
     return FEW_PARTICLES if row.name == SCATTER else row.name
 
 

@@ -10,6 +10,7 @@ from jaxgran.fitting.alternatives import Alternative, Explanations
 from jaxgran.fitting.headline import describe_range
 from jaxgran.fitting.measured_rows import UNKNOWN_NUMBER
 from jaxgran.fitting.result import Fit, by_label, prefix_of
+from jaxgran.fitting.rows import SIMULATION
 from jaxgran.fitting.setup import Request
 from jaxgran.fitting.verdict import Misfit, data_and_verb, symbols_of, why_undetermined
 from jaxgran.models.base import AbstractModel
@@ -274,7 +275,7 @@ def describe_convergence(result: Fit) -> Iterator[str]:
         yield (
             "the search did not converge: free fewer parameters, or in Python increase max_steps"
         )
-    noise = result.error_budget.get("simulation")
+    noise = result.error_budget.get(SIMULATION)
     if noise is not None:
         share = 100 * float(np.max(noise / result.standard_error))
         words = (

@@ -12,16 +12,25 @@ from jaxgran.data.measurement import Measurement
 from jaxgran.fitting.alternatives import Alternative
 from jaxgran.fitting.goodness import SIGNIFICANCE
 from jaxgran.fitting.result import CONDITIONAL, Fit, prefix_of
+from jaxgran.fitting.rows import (
+    CALIBRATION,
+    FEW_PARTICLES,
+    MEASUREMENT,
+    MODEL,
+    SAMPLING,
+    SIMULATION,
+    SLOPE,
+)
 from jaxgran.scene.parameters import symbol_of, unit_of
 
 BUDGET_PARTS = {
-    "measurement": "errors of the points",
-    "model": "error of the model's cooling rate in this scene",
-    "few particles": "random collisions of N particles",
-    "sampling": "the mean over tracked grains in place of all",
-    "slope": "error of derivatives through particles: large if the gas has a flow, or noisy",
-    "simulation": "noise of the simulations of the fit",
-    "calibration": "error of the scale of T, common to all points",
+    MEASUREMENT: "errors of the points",
+    MODEL: "error of the model's cooling rate in this scene",
+    FEW_PARTICLES: "random collisions of N particles",
+    SAMPLING: "the mean over tracked grains in place of all",
+    SLOPE: "error of derivatives through particles: large if the gas has a flow, or noisy",
+    SIMULATION: "noise of the simulations of the fit",
+    CALIBRATION: "error of the scale of T, common to all points",
     "other minima": "other values of the parameters that fit nearly as well",
 }
 """Meaning of the parts of the error budget; other parts have the name of what is uncertain."""
@@ -90,7 +99,7 @@ def report(result: Fit, *, explain: bool = False) -> str:
         else:
             lines += _curve(label, measurement)
             lines += _gas(measurement, result.scales[label])
-    steps = "simulations" if "simulation" in result.covariances else "steps of the search"
+    steps = "simulations" if SIMULATION in result.covariances else "steps of the search"
     lines.append(f"model    {result.model_name}, {result.iterations} {steps}")
     lines += ["", *_parameters(rows)]
     for row in rows:

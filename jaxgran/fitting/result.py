@@ -214,7 +214,7 @@ class Fit:
     def save(self, path: str | Path, *, overwrite: bool = False, **entries: Any) -> None:
         """Write the result to a JSON file that `Fit.load` reads.
 
-        A model, and gases with a law of a user, are left out.
+        The model, and gases and measurements with a law of a user, are left out.
 
         Args:
             path: the file.
@@ -235,7 +235,7 @@ class Fit:
         stored = {}
         for f in dataclasses.fields(self):
             try:
-                stored[f.name] = to_json(getattr(self, f.name))
+                stored[f.name] = None if f.name == "model" else to_json(getattr(self, f.name))
             except NotStorable:
                 stored[f.name] = None
         text = json.dumps(entries | {RESULT: stored}, indent=1, allow_nan=False) + "\n"

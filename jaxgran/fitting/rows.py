@@ -38,6 +38,24 @@ explanation, too."""
 CALIBRATION = "calibration"
 """The logarithm of a common factor of all measured T and T_rot."""
 
+MEASUREMENT = "measurement"
+"""Part of an error by the errors of the measured values."""
+
+FEW_PARTICLES = "few particles"
+"""Part of an error by the randomness of collisions of N grains."""
+
+SAMPLING = "sampling"
+"""Part of an error by T of some tracked grains in place of all."""
+
+MODEL = "model"
+"""Part of an error by the error of the model's cooling rate."""
+
+SIMULATION = "simulation"
+"""Part of an error by the noise of simulations."""
+
+SLOPE = "slope"
+"""Part of an error by the bias of the derivatives of simulations."""
+
 MIN_SCATTER = 1e-3
 """Smallest scatter of eps that is searched, over the smallest error."""
 

@@ -1,27 +1,28 @@
 """Errors of an estimate by a search through simulations: their parts by cause."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.measurement import Priors
-from jaxgran.fitting.information import FEW_PARTICLES, SAMPLING
-from jaxgran.fitting.parameters import (
-    SMOOTHNESS,
-    extra_parameters,
-    prior_residuals,
-    with_parameters,
+from jaxgran.fitting.parameters import SMOOTHNESS
+from jaxgran.fitting.prior_effects import prior_effects
+from jaxgran.fitting.rows import (
+    CALIBRATION,
+    FEW_PARTICLES,
+    MEASUREMENT,
+    MODEL,
+    SAMPLING,
+    SIMULATION,
+    SLOPE,
 )
-from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.simulations import Search, Simulations, information_by
 from jaxgran.models.error_model import ErrorModel
-from jaxgran.models.kinetic_theory import KineticTheory
-from jaxgran.models.linearise import linearise, with_neutral_elements
 from jaxgran.scene.gas import Gas
 
 
@@ -80,129 +81,127 @@ def expand(sims: Simulations, search: Search) -> Expansion:
     )
 
 
+class SimulatedEstimate(NamedTuple):
+    """An estimate by a search through simulations.
+
+    Attributes:
+        sims: the simulations and the measurement.
+        search: the search that ended at the estimate.
+        expansion: of the simulations near the estimate.
+        gas: the fitted gas.
+    """
+
+    sims: Simulations
+    search: Search
+    expansion: Expansion
+    gas: Gas
+
+    @property
+    def scale(self) -> Float[np.ndarray, "p 1"]:
+        """Derivatives of the parameters, SI, in the unconstrained ones."""
+        return self.sims.problem.slopes(self.search.average.flat)[:, None]
+
+
 def covariances_of(
-    priors: Priors, sims: Simulations, search: Search, expansion: Expansion, gas: Gas, bias: float
+    estimate: SimulatedEstimate, priors: Priors, bias: float
 ) -> dict[str, np.ndarray]:
     """Return the parts of the covariance of an estimate, SI, by cause.
 
     Args:
+        estimate: the estimate.
         priors: priors of the fit.
-        sims: simulations and the measurement.
-        search: search that ended at the estimate.
-        expansion: of the simulations near the estimate.
-        gas: fitted gas.
         bias: relative bias of the derivatives, see `derivative_bias`.
     """
-    average = search.average
-    comparison = average.comparison
-    sensitivity = expansion.sensitivity
-    smoothness = _smoothness_slopes(sims.problem, average.flat)
+    smoothness = _smoothness_slopes(estimate)
+    sensitivity = estimate.expansion.sensitivity
     information = sensitivity.T @ sensitivity + smoothness.T @ smoothness
-    covariance = np.linalg.pinv(information, rcond=sims.model.derivative_accuracy**2)
-    scale = sims.problem.slopes(average.flat)[:, None]
-    to_si = scale * covariance
-
-    parts = {}
-    for name in ("measurement", FEW_PARTICLES, SAMPLING, "model"):
-        by_source = information_by(comparison, expansion.slopes, name) / expansion.scatter
-        parts[name] = to_si @ by_source @ to_si.T
-    parts["simulation"] = scale * average.noise * scale.T
-    if smoothness.size:
-        parts[SMOOTHNESS] = to_si @ smoothness.T @ smoothness @ to_si.T
-    others = {name: prior for name, prior in priors.items() if name != SMOOTHNESS}
-    effects = prior_effects(gas, others, search.curve, sims.rows.uses_rotation)
-    scale_of_T = sims.rows.measurement.calibration_error
-    effects["calibration"] = np.full((expansion.computed.size, 1), scale_of_T)
-    for name, change in effects.items():
-        whitened = comparison.whiten(change) / expansion.scatter**0.5
-        moved = to_si @ sensitivity.T @ whitened
-        parts[name] = moved @ moved.T
-    # A slope that is too large by the bias widens the statistical error, and moves the estimate in
-    # proportion to its distance from the simulations.
-    distance = scale[:, 0] * (average.flat - np.mean([s.flat for s in search.near], axis=0))
-    statistical = sum(parts[x] for x in ("measurement", "simulation", FEW_PARTICLES, SAMPLING))
-    parts["slope"] = ((1 + bias) ** 2 - 1) * statistical + bias**2 * np.outer(distance, distance)
+    resolution = estimate.sims.model.derivative_accuracy
+    # The change of the estimate, SI, with the derivatives of ln L.
+    gain = estimate.scale * np.linalg.pinv(information, rcond=resolution**2)
+    parts = _parts_of_data(estimate, gain)
+    parts[SIMULATION] = estimate.scale * estimate.search.average.noise * estimate.scale.T
+    parts[SMOOTHNESS] = gain @ smoothness.T @ smoothness @ gain.T
+    parts |= _parts_of_priors(estimate, priors, gain)
+    parts[SLOPE] = _part_of_slope(estimate, parts, bias)
     return {name: part for name, part in parts.items() if np.any(part)}
 
 
-def _smoothness_slopes(problem: Problem, flat: np.ndarray) -> np.ndarray:
-    """Return derivatives of the law's own prior in the unknowns, shape (residuals, p)."""
-    gas = problem.measurements[0].scene
-
-    def prior(flat: Array) -> Array:
-        return with_parameters(gas, problem.values(flat)[""]).law.prior_residuals()
-
-    if not gas.law.prior_residuals().size:
+def _smoothness_slopes(estimate: SimulatedEstimate) -> Float[np.ndarray, "residuals p"]:
+    """Return the derivatives of the law's own prior in the parameters."""
+    flat = estimate.search.average.flat
+    if not estimate.gas.law.prior_residuals().size:
         return np.zeros((0, flat.size))
-    return np.asarray(jax.jacfwd(prior)(jnp.asarray(flat)))
+    slopes = jax.jacfwd(lambda flat: estimate.sims.gas_at(flat).law.prior_residuals())
+    return np.asarray(slopes(jnp.asarray(flat)))
 
 
-def derivative_bias(sims: Simulations, search: Search, gas: Gas, sensitivity: np.ndarray) -> float:
+def _parts_of_data(estimate: SimulatedEstimate, gain: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the parts by the errors and the scatter of the measured values, and the model's."""
+    comparison = estimate.search.average.comparison
+    expansion = estimate.expansion
+    parts = {}
+    for name in (MEASUREMENT, FEW_PARTICLES, SAMPLING, MODEL):
+        by_source = information_by(comparison, expansion.slopes, name) / expansion.scatter
+        parts[name] = gain @ by_source @ gain.T
+    return parts
+
+
+def _parts_of_priors(
+    estimate: SimulatedEstimate, priors: Priors, gain: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return the parts by the errors of what is known of the gas, and of the scale of T."""
+    sims, search, expansion, gas = estimate
+    others = {name: prior for name, prior in priors.items() if name != SMOOTHNESS}
+    effects = prior_effects(gas, others, search.curve, sims.rows.uses_rotation)
+    calibration_error = sims.rows.measurement.calibration_error
+    effects[CALIBRATION] = np.full((expansion.computed.size, 1), calibration_error)
+    parts = {}
+    for name, change in effects.items():
+        whitened = search.average.comparison.whiten(change) / expansion.scatter**0.5
+        moved = gain @ expansion.sensitivity.T @ whitened
+        parts[name] = moved @ moved.T
+    return parts
+
+
+def _part_of_slope(
+    estimate: SimulatedEstimate, parts: dict[str, np.ndarray], bias: float
+) -> np.ndarray:
+    """Return the part by a relative bias of the derivatives.
+
+    Too large a slope widens the statistical error, and moves the estimate in proportion to its
+    distance from the simulations.
+    """
+    search = estimate.search
+    center = np.mean([s.flat for s in search.near], axis=0)
+    distance = estimate.scale[:, 0] * (search.average.flat - center)
+    statistical = sum(parts[x] for x in (MEASUREMENT, SIMULATION, FEW_PARTICLES, SAMPLING))
+    return ((1 + bias) ** 2 - 1) * statistical + bias**2 * np.outer(distance, distance)
+
+
+def derivative_bias(estimate: SimulatedEstimate) -> float:
     """Return the relative bias of the derivatives of particles, as a weighted mean over the points.
 
     It comes from the curve of the last run or, if this has none, from an estimate by the model.
     """
-    curve = search.curve
+    model = estimate.sims.model
+    curve = estimate.search.curve
     bias = curve.derivative_bias
     if bias is None:
-        N = getattr(sims.model, "num_particles", None)
-        error_model = ErrorModel.from_curve(gas, _from_start(gas, curve), N)
-        whole = np.broadcast_to(sims.model.derivative_error(error_model), error_model.time.shape)
-        bias = whole[-curve.times.size :]
-    weights = np.sum(sensitivity[: curve.times.size] ** 2, axis=1)
-    whole = max(float(np.sum(weights)), np.finfo(float).tiny)
-    return abs(float(np.sum(weights * np.asarray(bias)) / whole))
+        N = getattr(model, "num_particles", None)
+        error_model = ErrorModel.from_curve(estimate.gas, _from_start(estimate.gas, curve), N)
+        since_start = np.broadcast_to(model.derivative_error(error_model), error_model.time.shape)
+        bias = since_start[-curve.times.size :]
+    weights = np.sum(estimate.expansion.sensitivity[: curve.times.size] ** 2, axis=1)
+    total = max(float(np.sum(weights)), np.finfo(float).tiny)
+    return abs(float(np.sum(weights * np.asarray(bias)) / total))
 
 
 def _from_start(gas: Gas, curve: CoolingCurve) -> CoolingCurve:
-    """Return T, a_2, collisions and T_rot of a curve from t = 0 on."""
-    names = ("temperature", "sonine", "collisions", "rotational_temperature")
-    known = {name: getattr(curve, name) for name in names if getattr(curve, name) is not None}
-    known |= {"times": curve.times, "status": np.zeros((), int)}
+    """Return T, a_2, collisions and T_rot of a curve from t = 0 on, where a_2 is 0."""
+    starts = {"times": 0.0, "temperature": gas.temperature, "sonine": 0.0, "collisions": 0.0}
+    if curve.rotational_temperature is not None:
+        starts["rotational_temperature"] = gas.value("rotational_temperature")
+    known = {name: x for name in starts if (x := getattr(curve, name)) is not None}
     if float(curve.times[0]) > 0:
-        firsts = {name: gas.parameters.get(name, 0.0) for name in known if name != "status"}
-        known |= {name: np.append(np.asarray(first), known[name]) for name, first in firsts.items()}
-    return CoolingCurve(**as_jax_arrays(known))
-
-
-def prior_effects(
-    gas: Gas, priors: Priors, computed: CoolingCurve, uses_rotation: bool
-) -> dict[str, Float[np.ndarray, "values size"]]:
-    """Return the changes of ln T and ln T_rot by one standard error of each prior.
-
-    Kinetic theory gives the changes.
-
-    Args:
-        gas: the fitted gas.
-        priors: the priors of the fit.
-        computed: the computed curve of the fit.
-        uses_rotation: whether the fit uses T_rot.
-    """
-    if not priors:
-        return {}
-    model = KineticTheory()
-    varied = extra_parameters(priors, ())
-    times = np.asarray(computed.times)
-    complete = with_neutral_elements(gas, model)
-    linear = linearise(model.simplified_for(gas), complete, times, varied)
-
-    def of_logs(part: dict[str, Any]) -> np.ndarray:
-        of_T = (part["temperature"].T / linear.values["temperature"]).T
-        of_rotation = np.zeros_like(of_T)
-        if uses_rotation:
-            name = "rotational_temperature"
-            of_rotation = (part[name].T / linear.values[name]).T
-        return np.concatenate([of_T, of_rotation])
-
-    values = {name: np.asarray(gas.value(name)) for name in varied}
-    by_parameter = np.concatenate([of_logs(linear.by_float[n]) for n in varied], axis=1)
-    rows = prior_residuals(priors, gas, values)
-    by_residual = np.block(
-        [
-            [slopes.get(n, np.zeros((row.size, values[n].size))) for n in varied]
-            for row, slopes in rows.values()
-        ]
-    )
-    changes = by_parameter @ np.linalg.pinv(by_residual)
-    ends = np.cumsum([given.size for given, _ in priors.values()])[:-1]
-    return dict(zip(priors, np.split(changes, ends, axis=1), strict=True))
+        known = {name: np.append(np.asarray(starts[name]), x) for name, x in known.items()}
+    return CoolingCurve(**as_jax_arrays(known | {"status": np.zeros((), int)}))

@@ -22,6 +22,7 @@ from jaxgran.fitting.parameters import as_floats, with_parameters
 from jaxgran.fitting.prediction import predicted_curve
 from jaxgran.fitting.problem import Problem, summed
 from jaxgran.fitting.result import Fit
+from jaxgran.fitting.rows import SLOPE
 from jaxgran.fitting.search import Minimum
 from jaxgran.fitting.setup import (
     Request,
@@ -31,6 +32,7 @@ from jaxgran.fitting.setup import (
 )
 from jaxgran.fitting.simulated_errors import (
     Expansion,
+    SimulatedEstimate,
     covariances_of,
     derivative_bias,
     expand,
@@ -143,11 +145,12 @@ def _result(
     p = flat.size
     expansion = expand(sims, search)
     gas = with_parameters(sims.rows.scene, as_jax_arrays(as_floats(problem.values(flat)[""])))
-    bias = derivative_bias(sims, search, gas, expansion.sensitivity)
+    estimate = SimulatedEstimate(sims, search, expansion, gas)
+    bias = derivative_bias(estimate)
     priors = request.priors.get("", {})
-    covariances = covariances_of(priors, sims, search, expansion, gas, bias)
+    covariances = covariances_of(estimate, priors, bias)
     # The range, by kinetic theory, knows all other parts.
-    further = [covariances[x] for x in (*priors, "slope") if x in covariances]
+    further = [covariances[x] for x in (*priors, SLOPE) if x in covariances]
     scale = problem.slopes(flat)
     noise = search.average.noise + sum(further, np.zeros((p, p))) / np.outer(scale, scale)
     if p > MAX_LINEARISED:

@@ -21,11 +21,11 @@ from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run_options import Run
 from jaxgran.fitting.comparison import Comparison
 from jaxgran.fitting.descent import Descent, Loss
-from jaxgran.fitting.information import FEW_PARTICLES, decrease_with_variance, inverse
+from jaxgran.fitting.information import decrease_with_variance, inverse
 from jaxgran.fitting.parameters import with_parameters
 from jaxgran.fitting.prediction import predicted_curve
 from jaxgran.fitting.problem import Problem
-from jaxgran.fitting.rows import CurveRows
+from jaxgran.fitting.rows import FEW_PARTICLES, CurveRows
 from jaxgran.fitting.search import Trace
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.kinetic_theory import KineticTheory

@@ -34,6 +34,7 @@ def test_an_experiment_is_read_from_a_scene(scene):
         ("N = 250", "", "a plan needs N"),
         ("T_err = 0.02", "T_rot_err = 0.02", "T_rot_err needs rough grains: give beta_t"),
         ("[experiment]", "[flight]", "[flight] is not read"),
+        (EXPERIMENT, "", "a plan needs a table [experiment] with times = [0.1, 0.3, 1.0] or"),
     ],
 )
 def test_what_makes_no_experiment_is_refused(scene, run, old, new, message):

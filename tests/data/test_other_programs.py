@@ -147,7 +147,11 @@ PARTICLES = {
     "blank line between frames": ("a.xyz", xyz(between="\n"), None),
     "no end of the last line": ("a.xyz", xyz()[:-1], "ends within a line"),
     "cut within the last number": ("a.dump", dump()[:-3], "ends within a line"),
-    "cut within the rows": ("a.dump", dump().rsplit("\n", 3)[0] + "\n", "not as many complete"),
+    "cut within the rows": (
+        "a.dump",
+        dump().rsplit("\n", 3)[0] + "\n",
+        "expected 30 rows of 8",
+    ),
     "cut within the head": ("a.dump", dump() + "ITEM: TIMESTEP\n7\n", "is incomplete"),
     "text after a frame": ("a.xyz", xyz() + "end\n", "must be a number of particles, got 'end'"),
     # 23 and siblings
@@ -345,6 +349,12 @@ TRAJECTORIES = {
     "GSD, no velocities": ("a.gsd", gsd(velocities=(0, 1, 3)), STEP, "frame 2: .*no velocities"),
     "another N": ("a.dump", dump(), STEP | {"N": "31"}, "N is 30, but 31 in the header"),
     "another size": ("a.gsd", gsd(diameter=2.0), STEP | {"diameter": "3"}, "diameter is 2, but 3"),
+    "a size of 1 m": (
+        "a.dump",
+        dump(names="id diameter x y z vx vy vz"),
+        STEP | {"diameter": "3"},
+        "diameter is 1, but 3",
+    ),
 }
 
 

@@ -97,6 +97,9 @@ def test_a_fit_is_shown_and_saved(tmp_path):
     loaded = jaxgran.Fit.load(tmp_path / "fit.json")
     assert repr(loaded) == repr(shown) and report(loaded) == report(shown)
     np.testing.assert_array_equal(loaded.curve.temperature, shown.curve.temperature)
+    of_particles = dataclasses.replace(shown, model=jaxgran.DSMC(100))
+    of_particles.save(tmp_path / "fit.json", overwrite=True)
+    assert jaxgran.Fit.load(tmp_path / "fit.json").model is None
     (tmp_path / "other.json").write_text("{}")
     with pytest.raises(ValueError, match="other.json: not a fit"):
         jaxgran.Fit.load(tmp_path / "other.json")
