@@ -28,7 +28,7 @@ from jaxgran.particles.hard.dynamics import (
 )
 from jaxgran.particles.hard.impacts import LawOfReplicas
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.geometry import wrapped
+from jaxgran.scene.geometry import wrap_on_host
 from jaxgran.scene.reduced import SphereScene, reduced_scene, sphere_scene
 from jaxgran.theory.averages import collision_rate
 
@@ -146,7 +146,7 @@ class HardSpheres(AbstractSpheres):
             return  # the run checks traced values
         side = float(self.scene(gas).side)
         boxes = np.asarray(self.start.position, float) / float(gas.diameter)
-        trees = [scipy.spatial.KDTree(wrapped(box, side), boxsize=side) for box in boxes]
+        trees = [scipy.spatial.KDTree(wrap_on_host(box, side), boxsize=side) for box in boxes]
         # The nearest neighbour of each sphere after itself; infinite if none overlaps.
         closest = min(
             np.min(tree.query(tree.data, 2, distance_upper_bound=1.0)[0][:, 1]) for tree in trees

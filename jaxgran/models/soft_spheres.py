@@ -22,7 +22,7 @@ from jaxgran.particles.soft.dynamics import SoftDynamics
 from jaxgran.scene.contact import elastic_constant
 from jaxgran.scene.elements import Frictional, Walls
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.geometry import wrapped
+from jaxgran.scene.geometry import wrap_on_host
 from jaxgran.scene.laws import Viscoelastic
 from jaxgran.scene.reduced import (
     ReducedContact,
@@ -173,7 +173,9 @@ class SoftSpheres(AbstractSpheres):
         stored = 0.0
         diameter = float(gas.diameter)
         for x in np.asarray(start.position, float):
-            tree = scipy.spatial.KDTree(wrapped(x, side), boxsize=None if gas.container else side)
+            tree = scipy.spatial.KDTree(
+                wrap_on_host(x, side), boxsize=None if gas.container else side
+            )
             distance = tree.sparse_distance_matrix(tree, diameter, output_type="coo_matrix").data
             stored += np.sum((diameter - distance[distance > 0]) ** 2.5) / 2
         stored *= 0.4 * float(elastic_constant(law.youngs_modulus, law.poisson_ratio, diameter))

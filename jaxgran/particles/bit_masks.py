@@ -13,7 +13,9 @@ CHUNK = 16384
 """Number of bits that are located at once."""
 
 
-def rows_where(mask: Bool[Array, "all"], size: int) -> tuple[Int[Array, "{size}"], Int[Array, ""]]:
+def rows_where(
+    mask: Bool[Array, "all"], size: int
+) -> tuple[Int[Array, "{size}"], Bool[Array, "{size}"], Int[Array, ""]]:
     """Return the indices of the True entries of a mask, in increasing order, and their number.
 
     The True entries are counted in words of 32 bits, and each is found in its word by bisection: on
@@ -24,13 +26,14 @@ def rows_where(mask: Bool[Array, "all"], size: int) -> tuple[Int[Array, "{size}"
         size: length of the array of indices.
 
     Returns:
-        The indices, with ``mask.size`` in unused rows, and the number of True entries. If that
-        exceeds `size`, only the first `size` of them are returned.
+        The indices, with 0 in unused rows, which rows are used, and the number of True entries. If
+        that exceeds `size`, only the first `size` of them are returned.
     """
     num_words = -(-mask.size // WORD)
     bits = jnp.pad(mask, (0, WORD * num_words - mask.size)).reshape(num_words, WORD)
     word, bit, count = bits_where(packed(bits), size)
-    return jnp.where(jnp.arange(size, dtype=jnp.int32) < count, 32 * word + bit, mask.size), count
+    real = jnp.arange(size, dtype=jnp.int32) < count
+    return jnp.where(real, WORD * word + bit, 0), real, count
 
 
 def packed(bits: Bool[Array, "words 32"]) -> UInt32[Array, "words"]:

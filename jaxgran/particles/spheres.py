@@ -22,7 +22,7 @@ from jaxgran.particles import observables
 from jaxgran.particles.capacity import Capacity, skin_for_pairs
 from jaxgran.particles.dynamics import AbstractDynamics, advance_time, time_left
 from jaxgran.particles.neighbours.lists import search_pairs
-from jaxgran.particles.neighbours.pairs import ListedPairs, Pairs, with_offsets, wrap
+from jaxgran.particles.neighbours.pairs import ListedPairs, Pairs, with_offsets
 from jaxgran.particles.start import (
     Placement,
     PlacementState,
@@ -30,7 +30,7 @@ from jaxgran.particles.start import (
     normalised_velocities,
 )
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
-from jaxgran.scene.geometry import MIN_BOX
+from jaxgran.scene.geometry import MIN_BOX, wrap
 from jaxgran.scene.reduced import SphereScene
 
 S = TypeVar("S", bound="AbstractSphereDynamics")
@@ -247,7 +247,7 @@ class AbstractSphereDynamics(AbstractDynamics):
         """Return the state at t = 0 with given positions and velocities, and its tangents."""
         position, velocity = start
         dtype = position.dtype
-        inside = wrap(self.scene.side, position)
+        inside = wrap(position, self.scene.side)
         drift = jnp.zeros((self.replicas, position.shape[1]), dtype)
         if self.scene.galilean_invariant:
             drift = jnp.mean(by_replica(velocity, self.replicas), axis=1)
@@ -342,7 +342,7 @@ class AbstractSphereDynamics(AbstractDynamics):
 
     def to_lab_frame(self, state: SphereState) -> tuple[Array, Array, Array | None]:
         drift = self.by_sphere(state.drift)
-        position = wrap(self.scene.side, state.position + drift * state.time)
+        position = wrap(state.position + drift * state.time, self.scene.side)
         velocity, spin = self.true_velocities(state)
         return position, velocity + drift, spin
 

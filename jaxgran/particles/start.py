@@ -19,11 +19,11 @@ from jaxgran.data.particles import Particles
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import AbstractProcess
 from jaxgran.particles.neighbours.lists import search_pairs
-from jaxgran.particles.neighbours.pairs import with_offsets, wrap
+from jaxgran.particles.neighbours.pairs import with_offsets
 from jaxgran.particles.snapshot import box_side
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS, Walls
 from jaxgran.scene.gas import Gas
-from jaxgran.scene.geometry import PACKING_LIMIT, sphere_surface
+from jaxgran.scene.geometry import PACKING_LIMIT, sphere_surface, wrap
 
 GAP = 1e-3
 """Smallest distance, in diameters, between the surfaces to which a pair is pushed apart."""
@@ -167,7 +167,7 @@ class Placement(AbstractProcess):
         """Build a neighbour list, and push until it is stale or no overlap is left."""
         side = self.side
         replicas, num_particles, dimension = self.shape
-        built = wrap(side, state.position)
+        built = wrap(state.position, side)
         listed = search_pairs(
             built,
             side,
@@ -217,7 +217,7 @@ class Placement(AbstractProcess):
         state, _ = jax.lax.while_loop(is_fresh, push_all, first)
         failed = state.overlap & (state.num_pushes >= MAX_PUSHES)
         fault = full | status.flag(status.OVERLAPS_REMAIN, failed)
-        return state._replace(position=wrap(side, state.position), needed=needed, status=fault)
+        return state._replace(position=wrap(state.position, side), needed=needed, status=fault)
 
 
 def check_start(start: Particles | None, gas: Gas, replicas: int, num_particles: int) -> None:

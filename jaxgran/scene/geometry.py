@@ -186,9 +186,15 @@ def impact_average(function: Callable[[Array], Array], like: Float[Array, ""]) -
     return jnp.sum(weights * function(nodes))
 
 
-def wrapped(
+def wrap(position: Float[Array, "n d"], side: ArrayLike) -> Float[Array, "n d"]:
+    """Return positions in a periodic box, 0 <= x < side: a remainder may round to the side."""
+    inside = jnp.mod(position, side)
+    return jnp.where(inside >= side, 0.0, inside)
+
+
+def wrap_on_host(
     position: Float[np.ndarray, "... d"], side: float | Float[np.ndarray, "d"]
 ) -> Float[np.ndarray, "... d"]:
-    """Return positions in a periodic box, 0 <= x < side: a remainder may round to the side."""
+    """Return positions in a periodic box as `wrap`, but compile nothing."""
     inside = position % side
     return np.where(inside < side, inside, 0.0)

@@ -15,7 +15,7 @@ from jaxgran.particles.neighbours.lists import (
     compiled_engine,
     search_pairs,
 )
-from jaxgran.particles.neighbours.pairs import with_offsets, wrap
+from jaxgran.particles.neighbours.pairs import with_offsets
 from jaxgran.particles.neighbours.sweep import pairs_by_sweep
 
 
@@ -125,19 +125,6 @@ def test_numbers_that_are_not_finite_have_no_pairs(by):
     for bad in (jnp.nan, jnp.inf):
         position = jnp.ones((4, 3)).at[2, 1].set(bad)
         assert find_pairs(position, 4.0, 1.0, capacity=3, by=by).count == 0
-
-
-@pytest.mark.parametrize("side", [1.0, 3.7])
-def test_wrap_lands_inside(side):
-    edges = [0.0, -1e-20, -1e-300, side, -side, 7 * side, np.nextafter(side, 0), 1.5 * side]
-    random = np.random.default_rng(4).uniform(-20, 20, 90)
-    position = np.append(edges, random)[:, None] * np.ones((1, 2))
-    inside = np.asarray(wrap(side, jnp.asarray(position)))
-    assert np.all(inside >= 0) and np.all(inside < side)
-    sides = np.round((position - inside) / side)
-    # Coordinates of up to 26 are rounded at 4e-15.
-    np.testing.assert_allclose(inside + sides * side, position, atol=1e-14)
-    np.testing.assert_array_equal(wrap(side, jnp.asarray(inside)), inside)
 
 
 def test_engine_follows_the_device_and_the_gas(monkeypatch):

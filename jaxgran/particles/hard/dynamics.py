@@ -29,7 +29,7 @@ from jaxgran.particles.elements import (
 )
 from jaxgran.particles.hard.prediction import ImpactCandidates, PairRows, Paths, first_impacts
 from jaxgran.particles.hard.window import MAX_ROUNDS, WindowProgress, execute_impacts
-from jaxgran.particles.neighbours.pairs import Pairs, wrap
+from jaxgran.particles.neighbours.pairs import Pairs
 from jaxgran.particles.neighbours.selection import select_members
 from jaxgran.particles.spheres import (
     FATAL,
@@ -37,6 +37,7 @@ from jaxgran.particles.spheres import (
     Segment,
     SphereState,
     advance_to_end,
+    by_replica,
     common_values,
     fastest,
     kinetic_energy,
@@ -47,7 +48,14 @@ from jaxgran.particles.spheres import (
 )
 from jaxgran.particles.start import initial_spins
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
+from jaxgran.scene.geometry import wrap
 from jaxgran.scene.reduced import ReducedScene, SphereScene
+
+FIRST_WINDOW = 0.125
+"""Length of the first window, over that with the wanted impacts at the rate of a gas.
+
+It is short, as many spheres are near contact at random positions.
+"""
 
 MIN_IMPACTS = 8
 """Smallest number of impacts that a window should have, in all replicas together."""
@@ -58,18 +66,32 @@ WINDOW_EXPONENT = 0.3
 The length changes by ``(wanted / executed impacts)^0.3``, as the number of impacts scatters.
 """
 
+MIN_CHANGE, MAX_CHANGE = 0.5, 1.5
+"""Least and largest ratio of the lengths of two successive windows by that controller."""
+
 SPEED_MARGIN = 1.15
 """Bound on the speeds within a window, over the speed of the fastest sphere before it."""
+
+BOUND_GROWTH = 1.3
+"""Factor on the bound on the speeds in a window that is repeated, as a sphere exceeded it."""
+
+LIST_LIFE = 0.95
+"""Life of a neighbour list, over the time in which the fastest sphere flies through the skin."""
 
 MAX_LISTED_PER_PARTICLE = 20
 """Listed pairs per particle above which the skin is shortened, as in dense clusters."""
 
+SKIN_REDUCTION = 0.8
+"""Factor by which the skin is shortened."""
+
 MIN_SKIN = 0.2
 """Skin in diameters below which it is not shortened."""
 
-
 ALLOWED_OVERLAP = 1e-9
 """Overlap in diameters that is allowed in a given start."""
+
+DRIVE_STREAM = 3
+"""Stream of the random numbers of a drive, beside those of the start."""
 
 
 class HardState(NamedTuple):
@@ -90,6 +112,15 @@ class HardState(NamedTuple):
     spin: Float[Array, "n spins"] | None = None
     rotational_gain: Float[Array, "replicas"] | None = None
     key: UInt32[Array, "3"] | None = None
+
+
+class WindowSums(NamedTuple):
+    """Sums of the fields of `WindowProgress` with the same names over the slots of each replica."""
+
+    dissipated: Float[Array, "replicas"]
+    rotational_gain: Float[Array, "replicas"] | None
+    num_impacts: Int[Array, "replicas"]
+    regularised: Int[Array, "replicas"]
 
 
 class HardDynamics(AbstractSphereDynamics):
@@ -118,7 +149,8 @@ class HardDynamics(AbstractSphereDynamics):
     def elastic(self) -> "HardDynamics":
         """Return the dynamics of smooth elastic spheres, between such walls, without drag.
 
-        A drag and a law without effect leave smooth spheres the program of the run.
+        Zero drag and a zero law keep the structure of a run of smooth spheres, whose compiled
+        program is reused.
         """
         material = self.scene.material
         walls = material.walls
@@ -132,7 +164,6 @@ class HardDynamics(AbstractSphereDynamics):
     def initial_internal(self, velocity: Float[Array, "n d"], key: PRNGKeyArray) -> HardState:
         dtype = velocity.dtype
         material = self.scene.material
-        # The first window is short: at random positions many spheres are near contact.
         rate = self.scene.collision_frequency
         if self.region is not None:
             rate = rate + 2 / jnp.min(self.region)
@@ -144,12 +175,12 @@ class HardDynamics(AbstractSphereDynamics):
             spin = initial_spins(key, self.shape, mean_square)
             gain = jnp.zeros(self.replicas, dtype)
         if material.drive is not None:
-            words = jax.random.bits(jax.random.fold_in(key, 3), (2,), jnp.uint32)
+            words = jax.random.bits(jax.random.fold_in(key, DRIVE_STREAM), (2,), jnp.uint32)
             counted_key = jnp.concatenate([words, jnp.zeros(1, jnp.uint32)])
         return HardState(
             age=jnp.full(len(velocity), jnp.inf, dtype),
             regularised=jnp.zeros(self.replicas, jnp.result_type(int)),
-            window=jnp.asarray(self.share / (8 * rate), dtype),
+            window=jnp.asarray(FIRST_WINDOW * self.share / rate, dtype),
             spin=spin,
             rotational_gain=gain,
             key=counted_key,
@@ -176,13 +207,13 @@ class HardDynamics(AbstractSphereDynamics):
         side = self.scene.side
         container = self.scene.container
         speed = jnp.max(fastest(state.velocity, self.replicas))
-        life = 0.95 * state.skin / jnp.maximum(speed, jnp.finfo(speed.dtype).tiny)
+        life = LIST_LIFE * state.skin / jnp.maximum(speed, jnp.finfo(speed.dtype).tiny)
         time_until_end = time_left(state, end)
         flown = 0.5 * jnp.minimum(life, time_until_end) * state.velocity
         if container is not None:
             inside = jnp.clip(state.position + flown, 0.5, container[None] - 0.5)
             flown = inside - state.position
-        listed = wrap(side, state.position + flown)
+        listed = wrap(state.position + flown, side)
         image = jnp.round((state.position + flown - listed) / side).astype(jnp.int32)
         prepared = state._replace(position=listed - flown, image=state.image + image)
         return prepared, listed, jnp.where(life < time_until_end, state.time + life, end)
@@ -226,30 +257,43 @@ class HardDynamics(AbstractSphereDynamics):
         progress = execute_impacts(
             kicked, listed, candidates, scene, duration, self.contact_time, self.all_elastic
         )
-        member_bound = bound[jnp.minimum(candidates.replica, self.replicas - 1)]
-        too_fast = jnp.any(progress.max_speed2 > member_bound**2)
         new = self._state_after_window(kicked, candidates, progress, duration)
         new = self._apply_drive(new, duration, 1.0)
         new = advance_to_end(new, duration, end, is_last)
 
-        distance2 = jnp.max(jnp.sum((new.position - listed) ** 2, -1))
-        exceeded = jnp.maximum(distance2, jnp.max(progress.max_distance2)) > (0.5 * old.skin) ** 2
-        fault = status.flag(status.SKIN_EXCEEDED, exceeded)
-        fault |= status.flag(status.STALLED, progress.num_rounds >= MAX_ROUNDS)
-        invalid = self.invalid_block(new, candidates.needed)
-        fault = jnp.where(invalid > 0, invalid, fault)
-        accepted = (fault == status.OK) & ~too_fast
-        repeat = too_fast & (invalid == 0)
+        fault, repeat = self._judge(new, listed, candidates, progress, bound)
+        accepted = (fault == status.OK) & ~repeat
         state = jax.tree.map(partial(jnp.where, accepted), new, old)
         next_duration = jnp.minimum(state.internal.window, time_left(state, end))
         next_position = state.position + state.velocity * next_duration
         next_distance2 = jnp.max(jnp.sum((next_position - listed) ** 2, -1))
-        fault = jnp.where(repeat, status.OK, fault).astype(jnp.int32)
         return Segment(
             state=state._replace(status=fault, needed=jnp.maximum(old.needed, candidates.needed)),
             stale=accepted & (next_distance2 > (0.5 * old.skin) ** 2),
-            retry=jnp.where(repeat, 1.3 * bound_factor, 1.0),
+            retry=jnp.where(repeat, BOUND_GROWTH * bound_factor, 1.0),
         )
+
+    def _judge(
+        self,
+        new: SphereState,
+        listed: Float[Array, "n d"],
+        candidates: ImpactCandidates,
+        progress: WindowProgress,
+        bound: Float[Array, "replicas"],
+    ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+        """Return the faults of a window, and whether it is repeated with a larger bound on speeds.
+
+        A window that lacks pairs or is not finite has that fault alone; one that is repeated, none.
+        """
+        distance2 = jnp.max(jnp.sum((new.position - listed) ** 2, -1))
+        exceeded = jnp.maximum(distance2, jnp.max(progress.max_distance2)) > (0.5 * new.skin) ** 2
+        member_bound = bound[jnp.minimum(candidates.replica, self.replicas - 1)]
+        too_fast = jnp.any(progress.max_speed2 > member_bound**2)
+        invalid = self.invalid_block(new, candidates.needed)
+        other = status.flag(status.SKIN_EXCEEDED, exceeded)
+        other |= status.flag(status.STALLED, progress.num_rounds >= MAX_ROUNDS)
+        fault = jnp.where(invalid > 0, invalid, jnp.where(too_fast, status.OK, other))
+        return fault.astype(jnp.int32), too_fast & (invalid == 0)
 
     def _select_candidates(
         self, state: SphereState, pairs: Pairs, duration: Array, bound: Float[Array, "replicas"]
@@ -267,14 +311,13 @@ class HardDynamics(AbstractSphereDynamics):
         v = state.velocity
         container = self.scene.container
         n = len(x)
-        size = len(x) // len(bound)
+        size = self.shape[1]
         # The listed pairs that can touch at the largest speeds are a small part of the list.
         displacement = x[pairs.i] - x[pairs.j] - pairs.offset
         gap = jnp.sqrt(jnp.sum(displacement * displacement, -1)) - 1
         gap = jnp.where(pairs.in_use, gap, jnp.inf)
-        near, num_near = rows_where(gap < 2 * bound[pairs.i // size] * duration, self.capacity.near)
-        real = jnp.arange(self.capacity.near, dtype=jnp.int32) < num_near
-        near = jnp.where(real, near, 0)
+        is_near = gap < 2 * bound[pairs.i // size] * duration
+        near, real, num_near = rows_where(is_near, self.capacity.near)
         i = pairs.i[near]
         j = pairs.j[near]
         offset = pairs.offset[near]
@@ -305,27 +348,26 @@ class HardDynamics(AbstractSphereDynamics):
     ) -> SphereState:
         """Return the state after a window at its old time, with the length of the next window."""
 
-        def by_replica(values):
-            return _sum_by_replica(values, candidates, self.replicas)
-
         def to_members(values, new):
             return values.at[candidates.members].set(new, mode="drop")
 
-        impacts = by_replica(progress.num_impacts) // 2
-        lost = by_replica(progress.dissipated)
+        sums = _window_sums(candidates, progress, self.replicas)
+        impacts = sums.num_impacts // 2
+        lost = sums.dissipated
         wanted = max(0.5 * self.share * len(state.position), MIN_IMPACTS)
         num_in_window = jnp.sum(impacts).astype(lost.dtype)
         if progress.num_wall_impacts is not None:  # each of one sphere, not of two
             num_on_walls = jnp.sum(progress.num_wall_impacts).astype(lost.dtype)
             num_in_window = num_in_window + num_on_walls / 2
-        ratio = jnp.clip((wanted / jnp.maximum(num_in_window, 1)) ** WINDOW_EXPONENT, 0.5, 1.5)
+        ratio = (wanted / jnp.maximum(num_in_window, 1)) ** WINDOW_EXPONENT
+        ratio = jnp.clip(ratio, MIN_CHANGE, MAX_CHANGE)
         paths = progress.paths
         internal = state.internal
-        more = by_replica(progress.regularised).astype(internal.regularised.dtype) // 2
+        more = sums.regularised.astype(internal.regularised.dtype) // 2
         regularised = internal.regularised + more
         rotational_gain = None
-        if progress.rotational_gain is not None:
-            rotational_gain = internal.rotational_gain + by_replica(progress.rotational_gain)
+        if sums.rotational_gain is not None:
+            rotational_gain = internal.rotational_gain + sums.rotational_gain
         # The last, short window before an end says nothing about the rate of impacts.
         full_length = duration > 0.5 * internal.window
         new = state._replace(
@@ -346,7 +388,7 @@ class HardDynamics(AbstractSphereDynamics):
         if state.tangents is None:
             return new
         return new._replace(
-            tangents=self._tangents_after(state, new, candidates, progress, duration)
+            tangents=self._tangents_after(state, candidates, progress.gains, sums, duration)
         )
 
     def recover(self, now: Segment, before: SphereState) -> SphereState:
@@ -357,7 +399,7 @@ class HardDynamics(AbstractSphereDynamics):
         # Only with enough capacity, so that a resumed run with another capacity does the same.
         crowded = state.needed[0] > MAX_LISTED_PER_PARTICLE * len(state.position)
         crowded &= state.status == status.OK
-        shorter = jnp.maximum(0.8 * state.skin, jnp.minimum(state.skin, MIN_SKIN))
+        shorter = jnp.maximum(SKIN_REDUCTION * state.skin, jnp.minimum(state.skin, MIN_SKIN))
         window = jnp.where(shorten, 0.5 * state.internal.window, state.internal.window)
         return state._replace(
             skin=jnp.where(crowded, shorter, state.skin),
@@ -376,11 +418,11 @@ class HardDynamics(AbstractSphereDynamics):
             return state
         variance = drive_variance(self.scene, state.time + state.time_rest, duration, place)
         key = jax.random.fold_in(threefry_key(counted_key[:2]), counted_key[2])
-        by_replica = state.velocity.reshape(replicas, -1, state.velocity.shape[-1])
+        velocity = by_replica(state.velocity, replicas)
         kicks = jax.vmap(random_kicks, (0, 0, None))(
-            jax.random.split(key, replicas), by_replica, self.scene.container is None
+            jax.random.split(key, replicas), velocity, self.scene.container is None
         )
-        velocity = (by_replica + jnp.sqrt(variance) * kicks).reshape(state.velocity.shape)
+        velocity = (velocity + jnp.sqrt(variance) * kicks).reshape(state.velocity.shape)
         internal = state.internal._replace(key=counted_key.at[2].add(jnp.uint32(1)))
         return state._replace(velocity=velocity, internal=internal)
 
@@ -397,41 +439,46 @@ class HardDynamics(AbstractSphereDynamics):
 
     def _tangents_after(
         self,
-        old: SphereState,
-        new: SphereState,
+        kicked: SphereState,
         candidates: ImpactCandidates,
-        progress: WindowProgress,
+        gains: Float[Array, "changes energies rows"],
+        sums: WindowSums,
         duration: Array,
     ) -> ExchangeTangents:
-        """Return the tangents after a window, from the states before and after it."""
-        tangents = old.tangents
+        """Return the tangents after a window.
+
+        Args:
+            kicked: state after the first half of the kicks.
+            candidates: pairs and particles of the window.
+            gains: of the energy in their impacts, `WindowProgress.gains`.
+            sums: over the impacts of the window.
+            duration: of the window.
+        """
+        tangents = kicked.tangents
         scene = self.scene
         replicas = self.replicas
         material = scene.material
-        lost = _sum_by_replica(progress.dissipated, candidates, replicas)
-        impacts = _sum_by_replica(progress.num_impacts, candidates, replicas)
         replica = candidates.replica
         of_gains = replica[candidates.rows.a]
         if scene.container is not None:
             of_gains = jnp.concatenate([of_gains, replica])
-        gains = jnp.zeros((*progress.gains.shape[:-1], replicas), lost.dtype)
-        gains = gains.at[..., of_gains].add(progress.gains, mode="drop")
-        before = [kinetic_energy(old.velocity, replicas)]
-        gained = [-lost]
-        if progress.rotational_gain is not None:
-            spins = jnp.sum(old.internal.spin.reshape(replicas, -1) ** 2, axis=1)
-            before.append(material.surface.inertia / 2 * spins)
-            gained.append(_sum_by_replica(progress.rotational_gain, candidates, replicas))
+        by_change = jnp.zeros((*gains.shape[:-1], replicas), gains.dtype)
+        by_change = by_change.at[..., of_gains].add(gains, mode="drop")
+        before = [kinetic_energy(kicked.velocity, replicas)]
+        gained = [-sums.dissipated]
+        if sums.rotational_gain is not None:
+            before.append(material.surface.inertia * kinetic_energy(kicked.internal.spin, replicas))
+            gained.append(sums.rotational_gain)
         num_energies = len(gained)
-        by_direction = gains[:-num_energies]
-        by_scale = gains[-num_energies:]
+        by_direction = by_change[:-num_energies]
+        by_scale = by_change[-num_energies:]
         if material.drive is not None:
 
             def heating(material: ReducedScene) -> Array:
                 changed = scene._replace(material=material)
-                start = old.time + old.time_rest
+                start = kicked.time + kicked.time_rest
                 first, second = (drive_variance(changed, start, duration, k) for k in (0.0, 1.0))
-                return old.velocity.size / replicas / 2 * (first + second)
+                return kicked.velocity.size / replicas / 2 * (first + second)
 
             heat, linear = jax.linearize(heating, material)
             by_direction = by_direction.at[:, 0].add(jax.vmap(linear)(tangents.directions)[:, None])
@@ -439,7 +486,7 @@ class HardDynamics(AbstractSphereDynamics):
             by_scale = by_scale.at[0, 0].add(-heat)
             gained[0] = gained[0] + heat
         return tangents.after(
-            jnp.stack(before), jnp.stack(gained), by_direction, by_scale, impacts / 2
+            jnp.stack(before), jnp.stack(gained), by_direction, by_scale, sums.num_impacts / 2
         )
 
 
@@ -459,10 +506,22 @@ def drive_variance(
     return kick_growth(strength, scene.drag_rates, start, jnp.asarray(duration), place)
 
 
-def _sum_by_replica(values: Array, candidates: ImpactCandidates, replicas: int) -> Array:
+def _window_sums(
+    candidates: ImpactCandidates, progress: WindowProgress, replicas: int
+) -> WindowSums:
     """Return the sums over the slots of each replica; an empty slot belongs to none."""
-    sums = jnp.zeros(replicas, values.dtype)
-    return sums.at[candidates.replica].add(values, mode="drop")
+
+    def total(values: Array) -> Array:
+        sums = jnp.zeros(replicas, values.dtype)
+        return sums.at[candidates.replica].add(values, mode="drop")
+
+    gain = progress.rotational_gain
+    return WindowSums(
+        dissipated=total(progress.dissipated),
+        rotational_gain=None if gain is None else total(gain),
+        num_impacts=total(progress.num_impacts),
+        regularised=total(progress.regularised),
+    )
 
 
 @partial(jax.jit, static_argnames="replicas")
@@ -501,8 +560,8 @@ def _values_with_elements(
     decay = drag_decay(scene.drag_rates, state.time + state.time_rest)
     velocity_factor = decay.velocity
     spin_factor = decay.spin
-    initial = kinetic_energy(state.first_velocity, replicas) / n
-    lost = initial - velocity_factor**2 * (initial - state.dissipated / n)
+    first = kinetic_energy(state.first_velocity, replicas) / n
+    lost = first - velocity_factor**2 * (first - state.dissipated / n)
     changed = {
         "temperature": values["temperature"] * velocity_factor**2,
         "velocity_correlation": values["velocity_correlation"] * velocity_factor,
@@ -511,7 +570,7 @@ def _values_with_elements(
         surface = scene.material.surface
         square = jnp.mean(state.internal.spin.reshape(replicas, -1) ** 2, axis=1)
         changed["rotational_temperature"] = surface.inertia * square * spin_factor**2
-        initial = NUM_SPIN_COMPONENTS[d] / 2 * surface.ratio
-        kept = spin_factor**2 * (initial + state.internal.rotational_gain / n)
-        lost = lost + initial - kept
+        rotational = NUM_SPIN_COMPONENTS[d] / 2 * surface.ratio
+        kept = spin_factor**2 * (rotational + state.internal.rotational_gain / n)
+        lost = lost + rotational - kept
     return changed | {"dissipated_energy": lost}

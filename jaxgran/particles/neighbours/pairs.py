@@ -27,7 +27,7 @@ class Pairs(NamedTuple):
     """Pairs of particles closer than a cutoff, each once, with the images that are close.
 
     Attributes:
-        i, j, count, lookahead: see `ListedPairs`.
+        i, j, count, lookahead: see `ListedPairs`, all of whose fields come first here.
         offset: multiple of the box side in each direction, such that ``x_i - x_j - offset`` is the
             shortest displacement of the pair. It remains valid while particles move without being
             wrapped.
@@ -35,9 +35,9 @@ class Pairs(NamedTuple):
 
     i: Int[Array, "pairs"]
     j: Int[Array, "pairs"]
-    offset: Float[Array, "pairs d"]
     count: Int[Array, ""]
     lookahead: Int[Array, ""]
+    offset: Float[Array, "pairs d"]
 
     @property
     def in_use(self) -> Bool[Array, "pairs"]:
@@ -49,14 +49,7 @@ class Pairs(NamedTuple):
 def with_offsets(
     position: Float[Array, "particles d"], side: ArrayLike, listed: ListedPairs
 ) -> Pairs:
-    """Add the offsets to the pairs that were found for these positions."""
+    """Add the offsets, which have no derivatives, to the pairs found for these positions."""
     position, side = jax.lax.stop_gradient((position, jnp.asarray(side)))
-    i, j, count, lookahead = listed
-    offset = side * jnp.round((position[i] - position[j]) / side)
-    return Pairs(i, j, offset, count, lookahead)
-
-
-def wrap(side: ArrayLike, position: Float[Array, "n d"]) -> Float[Array, "n d"]:
-    """Move positions by multiples of the side into [0, side)."""
-    inside = jnp.mod(position, side)
-    return jnp.where(inside >= side, 0.0, inside)  # rounding may give exactly `side`
+    offset = side * jnp.round((position[listed.i] - position[listed.j]) / side)
+    return Pairs(*listed, offset)

@@ -19,7 +19,7 @@ class Selection(NamedTuple):
     """Selected pairs, and the particles that belong to them: the members.
 
     Attributes:
-        rows: of the pairs, in the arrays from which they were selected.
+        rows: index of each selected pair in the given arrays.
         real: which of them hold a pair.
         members: particles, in increasing order; n in empty slots.
         first, second: slots of both particles of each pair among the members.
@@ -55,13 +55,21 @@ def select_members(
         max_members: capacity for members.
     """
     n = len(others)
-    rows, num_rows = rows_where(selected, max_rows)
-    real = jnp.arange(max_rows, dtype=jnp.int32) < num_rows
-    rows = jnp.where(real, rows, 0)
+    rows, real, num_rows = rows_where(selected, max_rows)
     ends = jnp.stack([i[rows], j[rows]])
     is_member = marked(others, ends, real[None])
-    members, num_members = rows_where(is_member, max_members)
+    members, is_used, num_members = rows_where(is_member, max_members)
+    members = jnp.where(is_used, members, n)
     slots = jnp.arange(max_members, dtype=jnp.int32)
+    # Where members are missing, their slot is that of another one: the caller rejects the block.
     slot = jnp.zeros(n, jnp.int32).at[members].set(slots, mode="drop")
     first, second = jnp.where(real[None], slot[ends], 0)
-    return Selection(rows, real, members, first, second, num_rows, num_members)
+    return Selection(
+        rows=rows,
+        real=real,
+        members=members,
+        first=first,
+        second=second,
+        num_rows=num_rows,
+        num_members=num_members,
+    )

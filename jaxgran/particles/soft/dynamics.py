@@ -21,7 +21,7 @@ from jaxgran.gradients.tangents import ContactTangents, RateSums, component_alon
 from jaxgran.particles import observables
 from jaxgran.particles.bit_masks import rows_where
 from jaxgran.particles.capacity import Capacity, max_skin
-from jaxgran.particles.neighbours.pairs import Pairs, wrap
+from jaxgran.particles.neighbours.pairs import Pairs
 from jaxgran.particles.neighbours.selection import marked, select_members
 from jaxgran.particles.soft.forces import (
     PAIR,
@@ -53,6 +53,7 @@ from jaxgran.particles.spheres import (
     with_dissipated_energy,
 )
 from jaxgran.particles.start import initial_spins
+from jaxgran.scene.geometry import wrap
 from jaxgran.scene.reduced import ReducedContact, ReducedScene, SphereScene
 from jaxgran.theory.equations import COOLING_CORRECTION
 
@@ -220,7 +221,7 @@ class SoftDynamics(AbstractSphereDynamics):
     @jax.jit
     def prepare(self, state: SphereState, end: ArrayLike) -> tuple[SphereState, Array, ArrayLike]:
         side = self.scene.side
-        inside = wrap(side, state.position)
+        inside = wrap(state.position, side)
         image = state.image + jnp.round((state.position - inside) / side).astype(jnp.int32)
         return state._replace(position=inside, image=image), inside, end
 
@@ -324,12 +325,10 @@ class SoftDynamics(AbstractSphereDynamics):
         velocity = state.velocity
         container = self.scene.container
         n = len(position)
-        max_near = self.capacity.near
         displacement = position[pairs.i] - position[pairs.j] - pairs.offset
         near = jnp.sum(displacement * displacement, -1) < (1 + margin) ** 2
         near &= pairs.in_use
-        rows, num_near = rows_where(near, max_near)
-        real = jnp.arange(max_near, dtype=jnp.int32) < num_near
+        rows, real, num_near = rows_where(near, self.capacity.near)
         i = pairs.i[rows]
         j = pairs.j[rows]
         offset = pairs.offset[rows]
