@@ -3,7 +3,7 @@
 - `fit`: the public function `fit`, the checks of its arguments and warnings.
 - `setup`: what a user asks for, as a `problem` with a first guess (`guesses`): `rows` are the
   measured values, which `measured_rows` makes of a measurement, `parameters` the unknowns on an
-  unconstrained scale, `priors` what is known of them.
+  unconstrained scale, with what is known of them.
 - `prediction`, `comparison`: a curve by a model with its derivatives, and its independent
   residuals, the `innovations` by a Kalman filter (`kalman`); `likelihood`: the public function of
   the gas.
