@@ -115,19 +115,14 @@ def frame_of_columns(
     density = DENSITY_UNITS.get(units.lower(), kilogram / length**3)
     equal = _equal_columns(columns, {"length": length, "mass": kilogram, "density": density})
     is_periodic = all(periodic[:d])
-    finite = all(np.all(np.isfinite(x)) for x in (position, velocity, sides))
-    outside = np.any((position < 0) | (position > sides)) and not is_periodic
-    faults = {
-        "some of its positions, velocities or sides are not finite numbers": not finite,
-        f"its box has the sides {sides}, which must be positive": np.any(sides <= 0),
-        "its box is periodic in some directions only; boxes of jaxgran are periodic, or have "
-        "walls, on all sides": any(periodic[:d]) and not is_periodic,
-        "some particles are outside of its box, which is not periodic": outside,
-        "all its particles move in one plane: give dimension=2 for disks, or 3": dimension is None
-        and _is_in_plane(position, velocity),
-    }
-    if message := next((message for message, is_wrong in faults.items() if is_wrong), None):
-        raise ValueError(message)
+    if any(periodic[:d]) and not is_periodic:
+        raise ValueError(
+            "its box is periodic in some directions only; boxes of jaxgran are periodic, or have "
+            "walls, on all sides"
+        )
+    _check_places(position, velocity, sides, is_periodic)
+    if dimension is None and _is_in_plane(position, velocity):
+        raise ValueError("all its particles move in one plane: give dimension=2 for disks, or 3")
     if is_periodic:
         position = np.mod(position, sides)
         position = np.where(position < sides, position, 0.0)  # rounding may give a side
@@ -135,6 +130,18 @@ def frame_of_columns(
         spin = (spin if d == 3 else spin[:, -1:]) / second
     time = None if time is None else second * time
     return Frame(position, velocity[:, :d], sides, spin, equal, is_periodic, time, step)
+
+
+def _check_places(
+    position: np.ndarray, velocity: np.ndarray, sides: np.ndarray, is_periodic: bool
+) -> None:
+    """Raise ValueError for numbers that are not finite, and for particles outside of their box."""
+    if not all(np.all(np.isfinite(x)) for x in (position, velocity, sides)):
+        raise ValueError("some of its positions, velocities or sides are not finite numbers")
+    if np.any(sides <= 0):
+        raise ValueError(f"its box has the sides {sides}, which must be positive")
+    if np.any((position < 0) | (position > sides)) and not is_periodic:
+        raise ValueError("some particles are outside of its box, which is not periodic")
 
 
 def _sorted_by_id(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -14,7 +14,7 @@ from jaxgran._utils.validation import POSITIVE
 from jaxgran.data.curve import CoolingCurve, above_noise
 from jaxgran.data.drop_test import DropTest
 from jaxgran.fitting.parameters import residuals_and_slopes, with_values
-from jaxgran.fitting.result import Fit
+from jaxgran.fitting.result import Fit, by_label
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.laws import RestitutionSpline
 from jaxgran.scene.parameter_fields import law_fields
@@ -34,6 +34,21 @@ RELATIVE_SPEEDS = np.linspace(0.005, 4.0, 800)
 MIN_VARIANCE = 1e-4
 """Relative eigenvalue of the covariance of ln eps below which a combination of its values is
 ignored: it is known only through the smoothness prior."""
+
+
+class FittedFormula(NamedTuple):
+    """A formula fitted to a learnt law.
+
+    Attributes:
+        chi2: chi^2 of ``L = -ln eps`` per degree of freedom; 1 or less means that the band contains
+            a law of this form.
+        p_value: probability of a larger chi^2.
+        gas: with the fitted number.
+    """
+
+    chi2: float
+    p_value: float
+    gas: Gas
 
 
 class RestitutionBand(NamedTuple):
@@ -61,16 +76,12 @@ class RestitutionBand(NamedTuple):
     visited: tuple[float, float]
     covariance: Float[np.ndarray, "speeds speeds"]
 
-    def compare(self, gas: Gas, free: str) -> tuple[float, float, Gas]:
+    def compare(self, gas: Gas, free: str) -> FittedFormula:
         """Fit a formula with one free number to the learnt law.
 
         Args:
             gas: with the law to compare.
             free: name of a float of this law, as "dissipative_constant" or "coefficient".
-
-        Returns:
-            chi^2 of L per degree of freedom, its p-value, and the fitted gas. Values of
-            1 or less mean that the band contains a law of this form.
 
         Raises:
             ValueError: for a band with one independent value.
@@ -89,13 +100,13 @@ class RestitutionBand(NamedTuple):
 
         def residuals(flat: np.ndarray) -> np.ndarray:
             changed = with_values(gas, {free: domain.from_free(flat[0])})
-            return whiten @ (np.asarray(_losses(changed, jnp.asarray(self.speeds))) - measured)
+            return whiten @ (np.asarray(_log_loss(changed, jnp.asarray(self.speeds))) - measured)
 
         first = np.ravel(domain.to_free(np.asarray(gas.value(free))))
         solution = scipy.optimize.least_squares(residuals, first)
         chi2 = 2 * float(solution.cost)
         fitted = gas.replace(**{free: domain.from_free(solution.x[0])})
-        return chi2 / degrees, float(scipy.stats.chi2.sf(chi2, degrees)), fitted
+        return FittedFormula(chi2 / degrees, float(scipy.stats.chi2.sf(chi2, degrees)), fitted)
 
 
 def visited_speeds(result: Fit) -> tuple[float, float]:
@@ -111,7 +122,7 @@ def visited_speeds(result: Fit) -> tuple[float, float]:
         raise ValueError("drop tests alone have no T: give a cooling curve, too")
     T = np.concatenate(parts)
     T = T[T > 0]
-    gas = first_gas(result)
+    gas = _first_gas(result)
 
     def quantile(share: float, temperature: float) -> float:
         relative = RELATIVE_SPEEDS
@@ -124,14 +135,14 @@ def visited_speeds(result: Fit) -> tuple[float, float]:
     return quantile(0.05, T.min()), quantile(0.95, T.max())
 
 
-def first_gas(result: Fit) -> Gas:
+def _first_gas(result: Fit) -> Gas:
     """Return the first of the fitted gases, which share their law."""
-    return next(iter(result.gas.values())) if isinstance(result.gas, dict) else result.gas
+    return next(iter(by_label(result.gas).values()))
 
 
 def describe_unvisited_knots(result: Fit) -> Iterator[str]:
     """Yield a sentence on knots of a fitted spline outside the visited speeds, if there are any."""
-    gas = first_gas(result)
+    gas = _first_gas(result)
     if not isinstance(gas.law, RestitutionSpline) or "drops" not in result.names:
         return
     if all(isinstance(m.data, DropTest) for m in result.measurements.values()):
@@ -161,41 +172,61 @@ def restitution_band(result: Fit, speeds: Any = None) -> RestitutionBand:
     >>> bool(band.low[0] < band.restitution[0] < band.high[0])
     True
     """
-    gas = first_gas(result)
-    own = [name for name in law_fields(gas.law) if name in result.names]
-    if not own:
-        raise ValueError(
-            f'no number of the law was free, only {", ".join(result.names)}. Fit with free="law"'
-        )
+    names = _names_of_law(result)
     visited = visited_speeds(result)
     grid = np.geomspace(*visited, NUM_COMPARED)
     speeds = grid if speeds is None else speeds
     POSITIVE.check("speeds", speeds, "Give normal impact speeds in m/s.")
     v = np.asarray(speeds, float)
-    law = jax.tree_util.Partial(_losses, speeds=jnp.asarray(np.append(v, grid)))
-    floats = {name: jnp.asarray(gas.value(name)) for name in own}
-    losses, slopes = residuals_and_slopes(law, gas, floats)
-    parts = [np.asarray(slopes[name]) for name in own]
+    learnt, of_all = _log_loss_with_covariance(result, names, np.append(v, grid))
+    learnt = learnt[: v.size]
+    covariance = of_all[: v.size, : v.size]
+    half_width = _simultaneous_factor(of_all[v.size :, v.size :]) * _standard_errors(covariance)
+    low = np.exp(-(learnt + half_width))
+    high = np.exp(-np.maximum(learnt - half_width, 0.0))
+    return RestitutionBand(v, np.exp(-learnt), low, high, visited, covariance)
+
+
+def _names_of_law(result: Fit) -> list[str]:
+    """Return the free parameters that belong to the law."""
+    names = [name for name in law_fields(_first_gas(result).law) if name in result.names]
+    if not names:
+        raise ValueError(
+            f'no number of the law was free, only {", ".join(result.names)}. Fit with free="law"'
+        )
+    return names
+
+
+def _log_loss_with_covariance(
+    result: Fit, names: list[str], speeds: Float[np.ndarray, "speeds"]
+) -> tuple[Float[np.ndarray, "speeds"], Float[np.ndarray, "speeds speeds"]]:
+    """Return L at some speeds with its covariance, by all errors of some parameters."""
+    gas = _first_gas(result)
+    law = jax.tree_util.Partial(_log_loss, speeds=jnp.asarray(speeds))
+    values = {name: jnp.asarray(gas.value(name)) for name in names}
+    learnt, slopes = residuals_and_slopes(law, gas, values)
+    slope = np.concatenate([np.asarray(slopes[name]) for name in names], axis=1)
     elements = list(enumerate(result.names_of_elements))
-    indices = [i for name in own for i, element in elements if element == name]
-    slope = np.concatenate(parts, axis=1)
-    of_parameters = result.covariance[np.ix_(indices, indices)]
-    covariance = slope @ of_parameters @ slope.T
-    error = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
-    # Quantile of the largest of the standardised errors at the speeds of the grid.
-    correlation = (covariance / np.outer(error, error))[v.size :, v.size :]
+    places = [i for name in names for i, element in elements if element == name]
+    return np.asarray(learnt), slope @ result.covariance[np.ix_(places, places)] @ slope.T
+
+
+def _standard_errors(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n"]:
+    """Return the standard errors of values, > 0."""
+    return np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
+
+
+def _simultaneous_factor(covariance: Float[np.ndarray, "n n"]) -> float:
+    """Return how many standard errors all values together depart by, with a probability of 95 %."""
+    error = _standard_errors(covariance)
+    correlation = covariance / np.outer(error, error)
     draws = np.random.default_rng(0).multivariate_normal(
-        np.zeros(grid.size), correlation, NUM_DRAWS, method="eigh"
+        np.zeros(error.size), correlation, NUM_DRAWS, method="eigh"
     )
-    factor = np.quantile(np.abs(draws).max(axis=1), 0.95)
-    losses = np.asarray(losses)[: v.size]
-    half_width = factor * error[: v.size]
-    low = np.exp(-(losses + half_width))
-    high = np.exp(-np.maximum(losses - half_width, 0.0))
-    own_covariance = covariance[: v.size, : v.size]
-    return RestitutionBand(v, np.exp(-losses), low, high, visited, own_covariance)
+    return float(np.quantile(np.abs(draws).max(axis=1), 0.95))
 
 
 @eqx.filter_jit
-def _losses(gas: Gas, speeds: Float[Array, "speeds"]) -> Float[Array, "speeds"]:
+def _log_loss(gas: Gas, speeds: Float[Array, "speeds"]) -> Float[Array, "speeds"]:
+    """Return L = -ln eps."""
     return -jnp.log(gas.restitution(speeds))
