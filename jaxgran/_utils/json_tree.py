@@ -95,7 +95,10 @@ def _made(place: str, fields: dict[str, Any]) -> Any:
     module, _, name = place.partition(":")
     if not module.startswith(f"{PACKAGE}."):
         raise ValueError(f"{place} is not a class of {PACKAGE}")
-    cls: Any = attrgetter(name)(import_module(module))
+    try:
+        cls: Any = attrgetter(name)(import_module(module))
+    except (ImportError, AttributeError) as e:
+        raise ValueError(f"another version of {PACKAGE} stored this: {place} is unknown") from e
     names = _field_names(cls) or []
     if fields.keys() != {*names}:
         raise ValueError(

@@ -70,7 +70,8 @@ class CoolingCurve(eqx.Module):
         elastic_energy: energy of the contacts per particle, J, of soft spheres.
         dissipated_energy: energy dissipated since t = 0 per particle, J, of soft and hard spheres.
             Drag dissipates energy, too. Unless something drives the gas, the sum of (d/2) m T,
-            (d_rot/2) m T_rot, elastic and dissipated energy is constant.
+            (d_rot/2) m T_rot, elastic and dissipated energy is constant. nan in a driven gas with
+            drag.
         regularised: impacts per particle, of hard spheres, that were made elastic to prevent
             inelastic collapse.
         flow_share: share of the kinetic energy in the longest waves of the flow, of spheres in

@@ -115,16 +115,16 @@ def open_frames(path: Path) -> list[FrameReader]:
         with import_gsd().open(str(path), "r") as file:
             return [partial(_read_gsd, path, k) for k in range(len(file))]
     text = read_bytes(path).decode("utf-8-sig")
+    is_cut = not text.endswith("\n")
     frames: list[FrameReader]
     if text.lstrip().startswith("ITEM:"):
         frames = [partial(_read_dump, part) for part in _parts_of_dump(text)]
     elif re.match(r"\s*\d+(\s|$)", text):
         frames = [partial(_read_xyz, part) for part in _parts_of_xyz(text)]
     else:
-        return [partial(_read_data, text)]
-    if text.endswith("\n"):
-        return frames
-    return [*frames[:-1], _refuse_cut]
+        frames = [partial(_read_data, text)]
+        is_cut = is_cut and "Atoms" in text
+    return [*frames[:-1], _refuse_cut] if is_cut else frames
 
 
 def import_gsd() -> Any:
@@ -282,7 +282,7 @@ def _read_data(text: str, dimension: int | None) -> Frame:
         raise ValueError(
             "no file of particles: give a LAMMPS dump or data file, extended XYZ, or GSD (.gsd)"
         )
-    if "xy xz yz" in text or "avec" in text:  # lines of the head that only slanted boxes have
+    if re.search(r"(xy xz yz|[abc]vec)\s*$", text, re.MULTILINE):  # of slanted boxes alone
         raise ValueError(SLANTED)
     low, high = np.array([[b[1], b[2]] for b in bounds if b], float).T
     style = re.search(r"^Atoms\s*#\s*(\w+)", text, re.MULTILINE)

@@ -38,7 +38,7 @@ COLUMN_UNITS = {
 UNITS = HEADER_UNITS | COLUMN_UNITS
 """Unit of each header key and column."""
 
-ANGLES = ("deg", "degree", "degrees", "°", "rad", "mrad")
+ANGLES = ("deg", "degree", "degrees", "°", "rad", "mrad", "arcmin", "arcsec", "grad", "turn")
 """Units of angles: an error in one of them is not relative, unlike an error in %."""
 
 MAX_UNIT = 60

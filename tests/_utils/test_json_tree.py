@@ -48,6 +48,12 @@ def test_fields_of_another_version_are_refused(value):
         from_json({**stored, "fields": to_json(value)["fields"] | {"further": 1.0}})
 
 
+@pytest.mark.parametrize("place", ["jaxgran.data.gone:Curve", "jaxgran.data.curve:Gone"])
+def test_classes_that_have_gone_are_refused(place):
+    with pytest.raises(ValueError, match="another version .* is unknown"):
+        from_json({"class": place, "fields": {}})
+
+
 def test_classes_of_others_are_refused():
     with pytest.raises(ValueError, match="is not a class of jaxgran"):
         from_json({"class": "pathlib:Path", "fields": {}})

@@ -175,6 +175,7 @@ CHANGES = [
     (DATA, "Velocities", "Bodies", "it has no section Velocities"),
     (DATA, "2 4 5 6 0 0 2", "3 4 5 6 0 0 2", "have different ids"),
     (DATA, "-1 3 xlo xhi", "3 -1 xlo xhi", "which must be positive"),
+    (DATA, "6 0 0 2\n", "6 0 0 2", "ends within a line"),
 ]
 for text, old, new, words in CHANGES:
     PARTICLES[words] = ("state.lammps", new.join(text.rsplit(old, 1)), words)
