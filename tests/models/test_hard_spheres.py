@@ -182,6 +182,15 @@ def test_lammps_curve():
 SIDE = 0.05
 
 
+def test_the_dissipated_energy_of_a_driven_gas_with_drag_is_not_known():
+    gas = hard_gas(0.9, 0.05, **SI)
+    rate = 0.1 / float(gas.mean_free_time)
+    drive = jaxgran.WhiteNoise(rate * float(gas.temperature))
+    gas = dataclasses.replace(gas, drag=jaxgran.StokesDrag(rate), drive=drive)
+    (curve,) = curves_of(gas, [0.5, 1.0], HardSpheres(50))
+    assert np.all(np.isfinite(curve.temperature)) and np.all(np.isnan(curve.dissipated_energy))
+
+
 @pytest.mark.slow
 def test_drag_takes_energy_of_perfectly_rough_disks_at_its_rate_alone():
     # In a box of unequal sides: impacts, on walls too, keep the energy, drag takes exp(-2 gamma t).
