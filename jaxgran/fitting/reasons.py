@@ -57,7 +57,7 @@ def _chi2(result: Fit) -> str:
     chance = f"{100 * p_value:.2g} %" if p_value < NEARLY_CERTAIN else "over 99 %"
     return (
         f"reduced chi^2 is {result.reduced_chi2:.3g} for {int(result.degrees_of_freedom)} degrees "
-        f"of freedom (a worse fit by chance: {chance})"
+        f"of freedom; the quantity that fits worst would fit worse by chance in {chance} of runs"
     )
 
 
