@@ -11,6 +11,7 @@ import pytest
 import scipy.interpolate
 
 import jaxgran
+from jaxgran.fitting.reasons import describe_search
 from tests.beads import glass_beads
 from tests.fitting.curves import A, fitted, synthetic
 
@@ -170,6 +171,10 @@ def test_a_law_is_learnt_from_impacts_alone():
     drops = jaxgran.DropTest([2e-3, 2e-2, 8e-2], [0.9, 0.85, 0.8], [0.01] * 3)
     result = jaxgran.fit(jaxgran.Measurement(gas_of(law), drops), free="law", progress=False)
     assert result.converged
+    # Another minimum is given with each number of the law.
+    several = dataclasses.replace(result, other_minima=np.array([[0.1, 0.2, 0.3]]))
+    (words,) = describe_search(several)
+    assert "drops[0] = 0.1, drops[1] = 0.2, drops[2] = 0.3" in words
 
 
 @pytest.mark.minutes
