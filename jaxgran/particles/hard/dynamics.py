@@ -573,6 +573,9 @@ def _values_with_elements(
         rotational = NUM_SPIN_COMPONENTS[d] / 2 * surface.ratio
         kept = spin_factor**2 * (rotational + state.internal.rotational_gain / n)
         lost = lost + rotational - kept
-    if scene.material.drive is not None and scene.material.drag is not None:
-        lost = jnp.full_like(lost, jnp.nan)  # drag takes an unknown part of the drive's heat
+    if scene.material.drive is not None:
+        # Drag takes an unknown part of the heat of the drive.
+        dragged = (velocity_factor < 1) | (spin_factor < 1)
+        driven = scene.material.drive > 0
+        lost = jnp.where(dragged & driven, jnp.nan, lost)
     return changed | {"dissipated_energy": lost}
