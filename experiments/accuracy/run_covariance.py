@@ -14,7 +14,8 @@ which is a matter of its own.
   spheres;
 - hard_spheres: the same scenes, and walls;
 - density: hard spheres of higher density, in boxes shorter than L_c;
-- flow: hard spheres in boxes about as long as L_c, in which a flow grows.
+- flow: hard spheres in boxes about as long as L_c, in which a flow grows;
+- soft_spheres: contacts of 2 to 10 % of the mean free time, which hold energy.
 
 Runs are kept in DIR and used again. --store writes their means and covariances to
 ``experiments/data/run_statistics.npz``, which tests read. There, "independent" runs are of an
@@ -32,12 +33,14 @@ import numpy as np
 
 import jaxgran
 from experiments.support.record import DATA, Options, run_parts
+from experiments.support.scenes import beads as beads_with_contacts
 from experiments.support.scenes import cool
 
 THEORY = jaxgran.KineticTheory(corrections=jaxgran.KineticTheory.all_corrections - {"softness"})
 ENSKOG = jaxgran.KineticTheory(
     corrections=jaxgran.KineticTheory.all_corrections - {"softness", "correlations"}
 )
+SOFT_THEORY = jaxgran.KineticTheory()
 STORED = DATA / "run_statistics.npz"
 DEPTH = 3.5
 """Largest ln(T_0/T) of gases that cool."""
@@ -128,7 +131,15 @@ FLOWING = {
     "phi .25, .8 L_c": Scene(lambda: beads(0.8, 0.25)),
     "phi .25, 1.3 L_c": Scene(lambda: beads(0.8, 0.25), 1030),
 }
-ALL = SMOOTH | ROUGH | OTHERS | WALLS | DENSE | FLOWING
+SOFT = {
+    "t_c .02": Scene(lambda: beads_with_contacts(0.25, 0.3, 0.02)),
+    "t_c .05": Scene(lambda: beads_with_contacts(0.05, 0.1, 0.05)),
+    "t_c .1": Scene(lambda: beads_with_contacts(0.1, 0.5, 0.1)),
+    "t_c .05, disks": Scene(lambda: beads_with_contacts(0.1, 0.2, 0.05, 2)),
+}
+"""The number is t_c/tau_c."""
+
+ALL = SMOOTH | ROUGH | OTHERS | WALLS | DENSE | FLOWING | SOFT
 
 
 class Runs(NamedTuple):
@@ -146,7 +157,12 @@ class Runs(NamedTuple):
 def simulated(scene: Scene, times: np.ndarray, kind: str, runs: int) -> Runs:
     """Return runs of one kind of particles."""
     gas, n = scene.make(), scene.num_particles
-    model = jaxgran.DSMC(n, runs) if kind == "dsmc" else jaxgran.HardSpheres(n, replicas=runs)
+    models = {
+        "dsmc": jaxgran.DSMC(n, runs),
+        "hard spheres": jaxgran.HardSpheres(n, replicas=runs),
+        "soft spheres": jaxgran.SoftSpheres(n, replicas=runs),
+    }
+    model = models[kind]
     curve = jaxgran.cool(gas, times, model=model, key=jax.random.key(7), progress=False)
     each = [curve.replicas.temperature, curve.replicas.rotational_temperature]
     return Runs(*(None if x is None else np.log(np.asarray(x)) for x in each))
@@ -168,8 +184,9 @@ def kept(scene: Scene, name: str, kind: str, options: Options) -> Runs:
 
 
 def theory_of(kind: str) -> jaxgran.KineticTheory:
-    """Return theory of one kind of runs: those of DSMC have no correlated velocities."""
-    return ENSKOG if kind == "dsmc" else THEORY
+    """Return theory of one kind of runs: DSMC has no correlated velocities, hard spheres have no
+    contacts."""
+    return {"dsmc": ENSKOG, "soft spheres": SOFT_THEORY}.get(kind, THEORY)
 
 
 def whitened(each: np.ndarray, covariance: np.ndarray) -> np.ndarray:
@@ -275,6 +292,10 @@ def flow(options: Options) -> Iterator[dict]:
     return rows_of(FLOWING, "hard spheres", options)
 
 
+def soft_spheres(options: Options) -> Iterator[dict]:
+    return rows_of(SOFT, "soft spheres", options)
+
+
 def independent(folder: Path) -> None:
     """Store the statistics of the runs of an independent code in a folder."""
     files = {"smooth": "smooth", "rough": "rough", "walls .75": "walls_75"}
@@ -288,4 +309,5 @@ def independent(folder: Path) -> None:
 
 if __name__ == "__main__":
     options = {"runs": 400, "store": False}
-    run_parts(__doc__, dsmc, hard_spheres, density, flow, prefix="run_covariance_", **options)
+    parts = dsmc, hard_spheres, density, flow, soft_spheres
+    run_parts(__doc__, *parts, prefix="run_covariance_", **options)

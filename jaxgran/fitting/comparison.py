@@ -214,6 +214,7 @@ def _nodes(curve: PredictedCurve, batch: Prediction, gas: Gas) -> Nodes:
         collisions=batch.collisions,
         size_ratio=batch.size_ratio,
         by_size_ratio=curve.by_size_ratio(gas, batch.size_ratio),
+        is_before=curve.is_before,
     )
 
 

@@ -92,9 +92,9 @@ def log_density_change(values: Array, log_computed: Array, errors: Array) -> Arr
     share = _share_of_log(log_computed, errors)
     slope = share / jnp.maximum(ratio, LOG_RATIO_FROM) + 1 - share
     unit = jnp.where(values > errors, values, errors)
-    near_zero = share < 1
-    change = -2 * (jnp.log(jnp.where(near_zero, unit * slope, 1.0)) - log_computed)
-    return jnp.where(near_zero, change, 0.0)
+    is_log = (share == 1) & (ratio >= LOG_RATIO_FROM)
+    change = -2 * (jnp.log(jnp.where(is_log, 1.0, unit * slope)) - log_computed)
+    return jnp.where(is_log, 0.0, change)
 
 
 def _share_of_log(log_computed: Array, errors: Array) -> Array:

@@ -13,10 +13,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxgran.fitting.rows import Noise
 from jaxgran.scene.gas import Gas
+from jaxgran.theory.contact_noise import contact_noise
 from jaxgran.theory.covariance import (
     NUM_DOUBLINGS,
     ROTATION_OFFSET,
@@ -61,6 +63,8 @@ class Nodes(NamedTuple):
         size_ratio: q of spheres of unequal sizes (`jaxgran.theory.sizes`); None for equal spheres.
         by_size_ratio: derivative of ln T in q, for the measured T: 0 unless T is given by the
             energy; None for equal spheres.
+        is_before: whether the measured time is before the start, as far from it as the node; shape
+            (nodes,). None if no time is.
     """
 
     log_temperature: Any
@@ -69,6 +73,7 @@ class Nodes(NamedTuple):
     collisions: Any
     size_ratio: Any = None
     by_size_ratio: Any = None
+    is_before: Any = None
 
 
 class Filtered(NamedTuple):
@@ -122,6 +127,7 @@ def filtered(
             residuals=residuals,
             variances=variances + SMALLEST_VARIANCE,
             sensitivity=sensitivity,
+            sizes=steps.sizes,
             used=used,
         )
         _, found = jax.lax.scan(partial(_filter_step, unit), start, at_nodes)
@@ -131,38 +137,70 @@ def filtered(
 class _Steps(NamedTuple):
     """What happens to the variables of a run from each node's predecessor to it.
 
-    The variables of the run (`jaxgran.theory.covariance.process`) are followed by the relative
-    error of theory's cooling rate over its standard deviation, and by the sampling error: n
-    variables in all.
+    The k variables of the run (`jaxgran.theory.covariance.process`) are followed by the relative
+    error of theory's cooling rate and by the passing errors of ln T, each over its standard
+    deviation: n variables in all.
 
     Attributes:
-        start: covariance of the variables of the run at its start, shape (n - 2, n - 2, gases).
+        start: covariance of the variables of the run at its start, shape (k, k, gases).
         growth: propagators less 1, shape (nodes, n, n, gases).
         increments: what is added to the covariance, shape (nodes, n, n, gases).
+        sizes: standard deviations of the passing errors, shape (nodes, n - k - 1, gases).
     """
 
     start: Any
     growth: Any
     increments: Any
+    sizes: Any
 
 
 def _steps(gas: Gas, nodes: Nodes, noise: Noise, differentiable: bool) -> _Steps:
-    """Return the steps of all variables; the sampling error is independent of all others."""
+    """Return the steps of all variables; the passing errors are independent of all others."""
     process = _process(gas, nodes, noise)
     shape = process.drift.shape
     flat = (*shape[:2], -1)
     doublings = NUM_DOUBLINGS if differentiable else _needed_doublings(process.drift)
     of_run = propagators(process.drift.reshape(flat), process.noise.reshape(flat), doublings)
-    growth, increments = (_with_one_more_variable(x.reshape(shape)) for x in of_run)
-    sample = shape[0]
-    collisions = _change(nodes.collisions)
-    forgotten = jnp.expm1(-SAMPLE_MEMORY * collisions)
-    sampled = -noise.sample * jnp.expm1(-2 * SAMPLE_MEMORY * collisions)
+    errors = _passing_errors(gas, nodes, noise)
+    decays = jnp.stack([error.decay for error in errors], axis=1)
+    growth, increments = (_with_more_variables(x.reshape(shape), len(errors)) for x in of_run)
+    places = shape[0] + np.arange(len(errors))
     return _Steps(
         start=process.start,
-        growth=growth.at[:, sample, sample].set(forgotten),
-        increments=increments.at[:, sample, sample].set(sampled),
+        growth=growth.at[:, places, places].set(jnp.expm1(-decays)),
+        increments=increments.at[:, places, places].set(-jnp.expm1(-2 * decays)),
+        sizes=jnp.stack([error.size for error in errors], axis=1),
     )
+
+
+class _PassingError(NamedTuple):
+    """A stationary scatter of the measured ln T, which T forgets exponentially.
+
+    Attributes:
+        decay: of its logarithm since the node before, shape (nodes, gases).
+        size: its standard deviation, of the same shape.
+    """
+
+    decay: Array
+    size: Array
+
+
+def _passing_errors(gas: Gas, nodes: Nodes, noise: Noise) -> list[_PassingError]:
+    """Return the sampling error, and the scatter by contacts of soft spheres."""
+    collisions = _change(nodes.collisions)
+    sample = jnp.broadcast_to(jnp.sqrt(noise.sample), collisions.shape)
+    errors = [_PassingError(SAMPLE_MEMORY * collisions, sample)]
+    log_T = nodes.log_temperature - nodes.log_temperature[:1]
+    contacts = jax.vmap(contact_noise, in_axes=(0, -1), out_axes=-1)(gas, log_T)
+    if contacts is not None:
+        size = jnp.sqrt(noise.inverse_number) * contacts.size
+        decay = collisions / contacts.memory
+        if nodes.is_before is not None:
+            # Two times on either side of the start are farther apart than their nodes.
+            is_beside = nodes.is_before | jnp.append(False, nodes.is_before[:-1])
+            decay = jnp.where(is_beside[:, None], jnp.inf, decay)
+        errors.append(_PassingError(decay, size))
+    return errors
 
 
 class _Process(NamedTuple):
@@ -170,7 +208,7 @@ class _Process(NamedTuple):
 
     Attributes:
         start: covariance of the variables of the run at its start, see `_Steps`.
-        drift: matrix of the equation times each step, shape (n - 1, n - 1, nodes, gases).
+        drift: matrix of the equation times each step, shape (k + 1, k + 1, nodes, gases).
         noise: covariance of its noise times each step, of the same shape.
     """
 
@@ -221,9 +259,9 @@ def _needed_doublings(drift: Array) -> Array:
     return jnp.clip(jnp.ceil(jnp.log2(64 * longest)), 1, NUM_DOUBLINGS).astype(int)
 
 
-def _with_one_more_variable(x: Float[Array, "n n nodes gases"]) -> Array:
-    """Return matrices with one more row and column of 0, shape (nodes, n + 1, n + 1, gases)."""
-    padded = jnp.pad(x, [(0, 1), (0, 1), (0, 0), (0, 0)])
+def _with_more_variables(x: Float[Array, "n n nodes gases"], count: int) -> Array:
+    """Return matrices with more rows and columns of 0, shape (nodes, n + count, n + count, gases)."""
+    padded = jnp.pad(x, [(0, count), (0, count), (0, 0), (0, 0)])
     return jnp.moveaxis(padded, 2, 0)
 
 
@@ -252,14 +290,13 @@ class _State(NamedTuple):
 def _start(steps: _Steps, noise: Noise, residuals: Array) -> _State:
     """Return the state at t = 0, before any of some residuals."""
     size = steps.growth.shape[1]
-    rate_error = size - 2
-    sample = size - 1
+    of_run = len(steps.start)
     mean = jnp.zeros((size, *residuals.shape[2:]), residuals.dtype)
-    covariance = jnp.zeros((size, size, residuals.shape[-1]), residuals.dtype)
-    covariance = covariance.at[:rate_error, :rate_error].set(steps.start)
+    # The error of the rate and passing errors are over their standard deviations.
+    unit = jnp.eye(size, dtype=residuals.dtype)[..., None]
+    covariance = jnp.broadcast_to(unit, (size, size, residuals.shape[-1]))
+    covariance = covariance.at[:of_run, :of_run].set(steps.start)
     covariance = covariance.at[LOG_T, LOG_T].add(noise.inverse_number * noise.first)
-    covariance = covariance.at[rate_error, rate_error].set(1.0)
-    covariance = covariance.at[sample, sample].set(noise.sample)
     return _State(mean, covariance)
 
 
@@ -271,6 +308,7 @@ class _AtNode(NamedTuple):
         rotation_slope: derivative of ln T_rot in y, 0 for smooth spheres.
         by_size_ratio: see `Nodes`.
         residuals, variances, sensitivity, used: see `filtered`.
+        sizes: see `_Steps`.
     """
 
     growth: Array
@@ -280,6 +318,7 @@ class _AtNode(NamedTuple):
     residuals: Array
     variances: Array
     sensitivity: Array
+    sizes: Array
     used: Array
 
 
@@ -296,9 +335,9 @@ def _filter_step(unit: Array, state: _State, at: _AtNode) -> tuple[_State, Filte
     moved = state.covariance + product(growth, state.covariance)
     covariance = moved + product(moved, transposed(growth)) + at.increment
     state = _State(mean, covariance)
-    # Measured: ln T of the gas with the sampling error, and ln T_rot = ln T + ln(T_rot/T).
-    sample = len(mean) - 1
-    of_T = at.sensitivity * unit[LOG_T] + unit[sample]
+    # Measured: ln T of the gas with the passing errors, and ln T_rot = ln T + ln(T_rot/T).
+    first = len(mean) - len(at.sizes)
+    of_T = at.sensitivity * unit[LOG_T] + jnp.sum(unit[first:] * at.sizes[:, None], axis=0)
     if at.by_size_ratio is not None:  # T by the energy also depends on q
         of_T = of_T + at.sensitivity * at.by_size_ratio * unit[RATIO]
     of_rotation = unit[LOG_T] + at.rotation_slope * unit[RATIO]

@@ -95,6 +95,7 @@ class PredictedCurve:
         times: of the nodes, s.
         sonine: a_2 at the nodes.
         place: place of each time of the data among the nodes.
+        is_before: whether the time of the data at a node is before the start.
         prediction: the curve.
         tangents: its derivatives in the unknowns, each in its unconstrained scale.
         elements: the unknowns.
@@ -107,6 +108,7 @@ class PredictedCurve:
     times: Float[np.ndarray, "nodes"]
     sonine: Float[np.ndarray, "nodes"]
     place: Int[np.ndarray, "times"]
+    is_before: Bool[np.ndarray, "nodes"]
     prediction: Prediction
     tangents: list[Prediction]
     elements: list[Element]
@@ -166,6 +168,7 @@ def predicted_curve(
         times=grid.times,
         sonine=curve.value("sonine"),
         place=grid.place,
+        is_before=is_before,
         prediction=prediction,
         tangents=[curve.tangent(element, prediction) for element in elements],
         elements=elements,

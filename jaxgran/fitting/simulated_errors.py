@@ -143,6 +143,9 @@ def _parts_of_data(estimate: SimulatedEstimate, gain: np.ndarray) -> dict[str, n
     for name in (MEASUREMENT, FEW_PARTICLES, SAMPLING, MODEL):
         by_source = information_by(comparison, expansion.slopes, name) / expansion.scatter
         parts[name] = gain @ by_source @ gain.T
+    # The rest of the scatter is the noise of the simulations, a part of its own.
+    measured = estimate.sims.theory.grains.inverse_number
+    parts[FEW_PARTICLES] *= measured / comparison.curve.rows.grains.inverse_number
     return parts
 
 

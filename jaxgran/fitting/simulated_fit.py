@@ -152,13 +152,13 @@ def _result(
     # The range, by kinetic theory, knows all other parts.
     further = [covariances[x] for x in (*priors, SLOPE) if x in covariances]
     scale = problem.slopes(flat)
-    noise = search.average.noise + sum(further, np.zeros((p, p))) / np.outer(scale, scale)
+    noise = sum(further, np.zeros((p, p))) / np.outer(scale, scale)
     if p > MAX_LINEARISED:
         covariances = {name: np.full_like(part, np.nan) for name, part in covariances.items()}
     explanations = None
     if search.converged and not request.quick:
         if set(request.names) <= of_theory.measurements[""].gas.domains.keys():
-            explanations = _explanations(of_theory, sims, flat, expansion.computed, noise)
+            explanations = _explanations(of_theory, search, expansion.computed, noise)
         else:
             notes = [*notes, NOT_COMPARED]
     if bias >= MIN_REPORTED_BIAS:
@@ -231,16 +231,17 @@ def _share_of_errors(sims: Simulations, search: Search, rows: Residuals) -> floa
 
 def _explanations(
     of_theory: Request,
-    sims: Simulations,
-    flat: np.ndarray,
+    search: Search,
     model_values: np.ndarray,
     noise: np.ndarray,
 ) -> Explanations | None:
     """Compare alternatives by kinetic theory, shifted to the curve of the fitted particles."""
     problem, first, _ = build_problem(of_theory)
+    flat = search.average.flat
     start = first.copy()
     start[: flat.size] = flat
-    (rows,) = problem.curves
+    noisy = search.average.comparison.curve.rows
+    rows = replace(problem.curves[0], grains=noisy.grains, simulation=noisy.simulation)
     values = problem.values(start)[""]
     predicted = predicted_curve(rows, problem.model.simplified_for(rows.scene), values, [])
     compared = predicted.prediction.compared[predicted.place]

@@ -185,17 +185,30 @@ class Simulations:
         )
         return simulation, curve
 
-    def comparison_with_theory(self, flat: np.ndarray, variance: np.ndarray) -> Comparison:
-        """Compare kinetic theory with the measurement, with a variance of the simulations."""
+    def compare_with_theory(self, flat: np.ndarray, rows: CurveRows) -> Comparison:
+        """Compare kinetic theory with the measured rows."""
         values = self.problem.values(flat)[""]
-        known = {name: x for name, x in values.items() if name in self.theory.gas.domains}
-        rows = replace(self.theory, simulation=variance.reshape(2, -1).T)
+        known = {name: x for name, x in values.items() if name in rows.gas.domains}
         return Comparison(predicted_curve(rows, KineticTheory(), known, []))
+
+    def with_noise(self, near: list[Simulation]) -> CurveRows:
+        """Return the measured curve for kinetic theory, with the noise of a mean of simulations.
+
+        Simulated grains scatter as measured ones do. Where a model does not know its number of
+        grains, the noise is that of its replicas, independent at each time.
+        """
+        number = getattr(self.model, "num_particles", None)
+        if number is None:
+            variance = np.mean([s.variance for s in near], axis=0) / len(near)
+            return replace(self.theory, simulation=variance.reshape(2, -1).T)
+        simulated = number * sum(len(s.deviation) for s in near)
+        grains = self.theory.grains
+        inverse_number = grains.inverse_number + 1 / simulated
+        return replace(self.theory, grains=grains._replace(inverse_number=inverse_number))
 
     def average(self, near: list[Simulation]) -> Average:
         """Return the mean of the Gauss-Newton estimates of some simulations, the newest last."""
-        variance = np.mean([s.variance for s in near], axis=0) / len(near)
-        comparison = self.comparison_with_theory(near[-1].flat, variance)
+        comparison = self.compare_with_theory(near[-1].flat, self.with_noise(near))
         estimates = []
         for s in near:
             # Slope and values of one run share their noise, whose product would move the estimate:
@@ -237,8 +250,8 @@ class Simulations:
     ) -> Float[np.ndarray, "p p"] | None:
         """Return the covariance that kinetic theory gives to the estimate of one simulation.
 
-        It is the part of the covariance by the scatter of the measured grains, times their number
-        over the number of simulated ones; None where a model does not know its number.
+        It is the part of the covariance by the scatter of all grains, measured and simulated, times
+        its share of one simulation; None where a model does not know its number.
         """
         number = getattr(self.model, "num_particles", None)
         if number is None:
@@ -246,7 +259,7 @@ class Simulations:
         resolution = self.model.derivative_accuracy
         covariance = np.linalg.pinv(information, rcond=resolution**2, hermitian=True)
         by_grains = covariance @ information_by(comparison, slope, FEW_PARTICLES) @ covariance
-        return by_grains / (self.theory.grains.inverse_number * number * replicas)
+        return by_grains / (comparison.curve.rows.grains.inverse_number * number * replicas)
 
 
 def information_by(
@@ -313,7 +326,7 @@ def by_gauss_newton(sims: Simulations, first: np.ndarray, max_simulations: int) 
             converged = bool(np.abs(step).max() < AVERAGING_DISTANCE)
             flat = flat + step
             noise = np.diag(average.noise)
-            variance = np.diag(inverse(average.information)) + noise
+            variance = np.diag(inverse(average.information))
             low_noise = np.all(noise <= MAX_NOISE_SHARE**2 * variance)
             in_errors = np.abs(step / np.sqrt(variance)).max()
             bar.update()
@@ -335,9 +348,8 @@ def by_descent(
     `NUM_LINEARISED` further simulations at the estimate give its errors.
     """
     measured = sims.measured
-    size = measured.size
-    theory = sims.comparison_with_theory(first, np.zeros(size))
-    whitening = jnp.asarray(theory.whiten(np.eye(size)))
+    theory = sims.compare_with_theory(first, sims.theory)
+    whitening = jnp.asarray(theory.whiten(np.eye(measured.size)))
 
     def loss(flat: Array, stream: int) -> Array:
         residuals = whitening @ (sims.logs_of(sims.curve_at(flat, stream)) - measured)

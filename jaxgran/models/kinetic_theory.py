@@ -387,6 +387,9 @@ class KineticTheory(AbstractModel):
 
             C(t_i, t_j) = (2/N) Phi_i Phi_j int_0^min(t_i, t_j) r zeta^2/(omega Phi^2) dt.
 
+        Contacts of soft spheres add the scatter of the energy that they hold, unless "softness" is
+        not among the corrections (`jaxgran.theory.contact_noise`).
+
         The mean over R independent runs has 1/R of it. It is the covariance of a gas that stays
         homogeneous, at low density: `jaxgran.models.error_model` has the factors of others.
 

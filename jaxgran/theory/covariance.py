@@ -26,6 +26,8 @@ oscillator that forgets within a crossing,
 with the noise of Poissonian impacts in W and W', and the width W that centres have. n and u are
 stationary from t = 0 on: the spheres are in flight then.
 
+The energy that contacts of soft spheres hold scatters T, too: `jaxgran.theory.contact_noise`.
+
 Where sizes differ the second variable is q, the logarithm of the ratio of the mean square
 velocities of small and large spheres (`jaxgran.theory.sizes`). Impacts between small and large
 spheres exchange energy, which changes T and not the energy. At t = 0 the velocities of both halves
@@ -51,6 +53,7 @@ from jaxgran.theory.averages import (
     loss_nodes,
     rough_energy_moments,
 )
+from jaxgran.theory.contact_noise import contact_covariance, contact_noise
 from jaxgran.theory.density import Density
 from jaxgran.theory.elements import coulomb_limit, mean_impulse
 from jaxgran.theory.moments import Spins
@@ -129,7 +132,8 @@ def run_covariance(
             spins are taken to be Gaussian, and C of T_rot is some 7 % too low.
         rotation: return the covariance of ln T_rot, too.
         energy: T is the mean energy over the mean mass, see `jaxgran.theory.sizes`.
-        softness, correlations: as in `jaxgran.KineticTheory`.
+        softness, correlations: as in `jaxgran.KineticTheory`; contacts scatter T, too
+            (`jaxgran.theory.contact_noise`).
 
     Returns:
         C of ln T, shape (times, times); with `rotation` of ln T, then of ln T_rot, shape (2 times,
@@ -155,7 +159,13 @@ def run_covariance(
         by_rotation = (ratio + ROTATION_OFFSET) / jnp.where(turning, ratio, jnp.inf)
         outputs.append([turning + zero, by_rotation, *outputs[0][2:]])
     outputs = jnp.stack([jnp.stack(row) for row in outputs])
-    return covariance_at_all_times(starts[..., 0], growth, noise, outputs)
+    whole = covariance_at_all_times(starts[..., 0], growth, noise, outputs)
+    contacts = contact_noise(gas, mean.log_temperature) if softness else None
+    if contacts is None:
+        return whole
+    later = slice(1, theta.size)
+    by_contacts = contact_covariance(contacts, mean.collisions)[later, later]
+    return whole.at[later, later].add(by_contacts)
 
 
 def run_process(

@@ -62,7 +62,7 @@ def test_stored_runs_scatter_as_theory_says(name):
         ("disks", "dsmc"),
         ("sliding", "dsmc"),
         ("driven", "dsmc"),
-        pytest.param("walls .9", "hard", marks=pytest.mark.minutes),
+        pytest.param("walls .9", "hard spheres", marks=pytest.mark.minutes),
     ],
 )
 def test_runs_scatter_as_theory_says(name, kind):

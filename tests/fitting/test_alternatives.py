@@ -32,13 +32,15 @@ from tests.fitting.curves import (
     drawn,
     fitted,
     in_range,
+    rough_beads,
     synthetic,
 )
 
 
 @pytest.mark.slow
 def test_a_search_that_was_cut_short_is_said_to_be():
-    result = jaxgran.fit(jaxgran.example_measurement("dilute"), max_steps=1)
+    gas = rough_beads(0.2)
+    result = fitted(gas, synthetic(gas, jax.random.key(0)), max_steps=1, quick=False)
     assert not result.converged and result.ranges == {}
     assert result.grade == "not consistent" and "did not converge" in result.verdict
     assert any("increase max_steps" in reason for reason in result.reasons)

@@ -75,11 +75,21 @@ def test_the_density_of_a_value_is_normalised():
         residuals = log_ratio(measured, log_computed, errors)
         change = log_density_change(measured, log_computed, errors)
         # The density of the residual times its slope; the unit is that of `log_density_change`.
-        unit = np.where(values > error, values, error) if computed < 10 else values
+        unit = np.where(values > error, values, error)
         density = np.exp(-0.5 * (residuals * computed / error) ** 2 - 0.5 * change)
         density *= computed / error / unit / np.sqrt(2 * np.pi)
         whole = np.trapezoid(np.where(values > -7, density, 0.0), values)
         assert whole == pytest.approx(1.0, abs=0.02), computed
+
+
+def test_the_density_of_a_small_value_has_no_jump_where_ln_T_is_compared():
+    # -2 ln L fell by 1 where the computed T rose past 10 errors, and the search stopped there.
+    below, above = (
+        float(log_density_change(jnp.asarray(3.0), jnp.log(x), jnp.asarray(1.0)))
+        for x in (9.9999, 10.0001)
+    )
+    assert below == pytest.approx(above, abs=1e-3)
+    assert above == pytest.approx(-2 * np.log(0.6), rel=1e-3)
 
 
 def test_ln_T_is_compared_far_from_zero_bit_for_bit():
