@@ -1,4 +1,4 @@
-"""Dynamics of hard spheres in windows of time, with a drive, records and tangents.
+"""Dynamics of hard spheres in windows of time, with a drive and tangents.
 
 Many impacts are executed at once in each window. White noise drives the spheres by random kicks:
 each window begins and ends with half of its kicks. Units as in `jaxgran.particles.hard.impacts`.
@@ -22,12 +22,12 @@ from jaxgran.particles.dynamics import time_left
 from jaxgran.particles.elements import (
     MAX_KICK,
     drag_decay,
-    exchange_slopes,
     kick_growth,
     random_kicks,
     threefry_key,
 )
 from jaxgran.particles.hard.prediction import ImpactCandidates, PairRows, Paths, first_impacts
+from jaxgran.particles.hard.records import hard_records
 from jaxgran.particles.hard.window import MAX_ROUNDS, WindowProgress, execute_impacts
 from jaxgran.particles.neighbours.pairs import Pairs
 from jaxgran.particles.neighbours.selection import select_members
@@ -38,16 +38,13 @@ from jaxgran.particles.spheres import (
     SphereState,
     advance_to_end,
     by_replica,
-    common_values,
     fastest,
     kinetic_energy,
     next_block,
     repeat_until,
     temperature,
-    with_dissipated_energy,
 )
 from jaxgran.particles.start import initial_spins
-from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.geometry import wrap
 from jaxgran.scene.reduced import ReducedScene, SphereScene
 
@@ -189,14 +186,6 @@ class HardDynamics(AbstractSphereDynamics):
     def initial_tangents(self, state: SphereState, directions: ReducedScene) -> ExchangeTangents:
         material = self.scene.material
         return ExchangeTangents.initial(directions, material, state.velocity, self.replicas)
-
-    def true_velocities(self, state: SphereState) -> tuple[Array, Array | None]:
-        decay = drag_decay(self.scene.drag_rates, state.time + state.time_rest)
-        spin = state.internal.spin
-        return state.velocity * decay.velocity, None if spin is None else spin * decay.spin
-
-    def observe(self, state: SphereState) -> Records:
-        return hard_records(state, self.scene, self.replicas)
 
     @jax.jit
     def prepare(self, state: SphereState, end: ArrayLike) -> tuple[SphereState, Array, Array]:
@@ -489,6 +478,14 @@ class HardDynamics(AbstractSphereDynamics):
             jnp.stack(before), jnp.stack(gained), by_direction, by_scale, sums.num_impacts / 2
         )
 
+    def true_velocities(self, state: SphereState) -> tuple[Array, Array | None]:
+        decay = drag_decay(self.scene.drag_rates, state.time + state.time_rest)
+        spin = state.internal.spin
+        return state.velocity * decay.velocity, None if spin is None else spin * decay.spin
+
+    def observe(self, state: SphereState) -> Records:
+        return hard_records(state, self.scene, self.replicas)
+
 
 def allowed_overlap(dtype: Any, side: Any) -> Any:
     """Return the overlap up to which spheres of a start count as hard.
@@ -522,60 +519,3 @@ def _window_sums(
         num_impacts=total(progress.num_impacts),
         regularised=total(progress.regularised),
     )
-
-
-@partial(jax.jit, static_argnames="replicas")
-def hard_records(state: SphereState, scene: SphereScene, replicas: int) -> Records:
-    """Return the records of a state.
-
-    In a scene with elements the dissipated energy includes all losses in impacts and to drag.
-    """
-    values, velocity = common_values(state, scene, replicas)
-    material = scene.material
-    tangents = state.tangents
-    (n, d) = velocity.shape[1:]
-    regularised = state.internal.regularised.astype(jnp.result_type(float))
-    values["regularised"] = 2 / n * regularised
-    if material.has_elements:
-        values |= _values_with_elements(state, scene, values)
-    if tangents is None:
-        return Records(values, {}, {})
-    drag_directions = jax.tree.map(
-        lambda x: x * scene.collision_frequency, tangents.directions.drag
-    )
-    time = state.time + state.time_rest
-    rates, slopes = exchange_slopes(values, tangents, scene.drag_rates, drag_directions, time, n, d)
-    if not material.has_elements:
-        rates, slopes = (with_dissipated_energy(x, d) for x in (rates, slopes))
-    return Records(values, rates, slopes)
-
-
-def _values_with_elements(
-    state: SphereState, scene: SphereScene, values: dict[str, Array]
-) -> dict[str, Array]:
-    """Return the records of rotation, and the records that drag changes."""
-    replicas = len(values["temperature"])
-    n = len(state.velocity) // replicas
-    d = state.velocity.shape[1]
-    decay = drag_decay(scene.drag_rates, state.time + state.time_rest)
-    velocity_factor = decay.velocity
-    spin_factor = decay.spin
-    first = kinetic_energy(state.first_velocity, replicas) / n
-    lost = first - velocity_factor**2 * (first - state.dissipated / n)
-    changed = {
-        "temperature": values["temperature"] * velocity_factor**2,
-        "velocity_correlation": values["velocity_correlation"] * velocity_factor,
-    }
-    if state.internal.spin is not None:  # None in equilibration
-        surface = scene.material.surface
-        square = jnp.mean(state.internal.spin.reshape(replicas, -1) ** 2, axis=1)
-        changed["rotational_temperature"] = surface.inertia * square * spin_factor**2
-        rotational = NUM_SPIN_COMPONENTS[d] / 2 * surface.ratio
-        kept = spin_factor**2 * (rotational + state.internal.rotational_gain / n)
-        lost = lost + rotational - kept
-    if scene.material.drive is not None:
-        # Drag takes an unknown part of the heat of the drive.
-        dragged = (velocity_factor < 1) | (spin_factor < 1)
-        driven = scene.material.drive > 0
-        lost = jnp.where(dragged & driven, jnp.nan, lost)
-    return changed | {"dissipated_energy": lost}
