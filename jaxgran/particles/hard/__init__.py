@@ -3,7 +3,8 @@
 - `prediction`: the next impact of each pair, on walls too, and until when each path is final.
 - `impacts`: the effect of impacts, and its derivatives.
 - `window`: the execution of all impacts of a window.
-- `dynamics`: the sequence of windows, with a drive and tangents.
+- `drive`: random kicks at both ends of a window, and their heat.
+- `dynamics`: the sequence of windows, with tangents.
 - `records`: what a run records of its states.
 
 May import the modules directly under `particles`, except for `run`, and the layers below

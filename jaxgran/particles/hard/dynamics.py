@@ -1,7 +1,7 @@
-"""Dynamics of hard spheres in windows of time, with a drive and tangents.
+"""Dynamics of hard spheres in windows of time.
 
-Many impacts are executed at once in each window. White noise drives the spheres by random kicks:
-each window begins and ends with half of its kicks. Units as in `jaxgran.particles.hard.impacts`.
+Many impacts are executed at once in each window. A window begins and ends with half of the kicks of
+a drive. Units as in `jaxgran.particles.hard.impacts`.
 """
 
 import dataclasses
@@ -19,12 +19,13 @@ from jaxgran.gradients.tangents import ExchangeTangents
 from jaxgran.particles.bit_masks import rows_where
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import time_left
-from jaxgran.particles.elements import (
-    MAX_KICK,
-    drag_decay,
-    kick_growth,
-    random_kicks,
-    threefry_key,
+from jaxgran.particles.elements import drag_decay
+from jaxgran.particles.hard.drive import (
+    heat_of_kicks,
+    initial_kick_key,
+    kick_at_end,
+    kick_at_start,
+    longest_window,
 )
 from jaxgran.particles.hard.prediction import ImpactCandidates, PairRows, Paths, first_impacts
 from jaxgran.particles.hard.records import hard_records
@@ -37,12 +38,10 @@ from jaxgran.particles.spheres import (
     Segment,
     SphereState,
     advance_to_end,
-    by_replica,
     fastest,
     kinetic_energy,
     next_block,
     repeat_until,
-    temperature,
 )
 from jaxgran.particles.start import initial_spins
 from jaxgran.scene.geometry import wrap
@@ -86,9 +85,6 @@ MIN_SKIN = 0.2
 
 ALLOWED_OVERLAP = 1e-9
 """Overlap in diameters that is allowed in a given start."""
-
-DRIVE_STREAM = 3
-"""Stream of the random numbers of a drive, beside those of the start."""
 
 
 class HardState(NamedTuple):
@@ -166,21 +162,20 @@ class HardDynamics(AbstractSphereDynamics):
             rate = rate + 2 / jnp.min(self.region)
         spin = None
         gain = None
-        counted_key = None
+        kick_key = None
         if material.surface is not None:
             mean_square = (material.surface.ratio / material.surface.inertia).astype(dtype)
             spin = initial_spins(key, self.shape, mean_square)
             gain = jnp.zeros(self.replicas, dtype)
         if material.drive is not None:
-            words = jax.random.bits(jax.random.fold_in(key, DRIVE_STREAM), (2,), jnp.uint32)
-            counted_key = jnp.concatenate([words, jnp.zeros(1, jnp.uint32)])
+            kick_key = initial_kick_key(key)
         return HardState(
             age=jnp.full(len(velocity), jnp.inf, dtype),
             regularised=jnp.zeros(self.replicas, jnp.result_type(int)),
             window=jnp.asarray(FIRST_WINDOW * self.share / rate, dtype),
             spin=spin,
             rotational_gain=gain,
-            key=counted_key,
+            key=kick_key,
         )
 
     def initial_tangents(self, state: SphereState, directions: ReducedScene) -> ExchangeTangents:
@@ -239,15 +234,16 @@ class HardDynamics(AbstractSphereDynamics):
         old = now.state
         bound_factor = now.retry
         scene = self.scene
-        duration, is_last = next_block(old, self._longest_window(old), end)
-        kicked = self._apply_drive(old, duration, 0.0)
+        longest = jnp.minimum(old.internal.window, longest_window(old, scene))
+        duration, is_last = next_block(old, longest, end)
+        kicked = kick_at_start(old, scene, duration)
         bound = SPEED_MARGIN * bound_factor * fastest(kicked.velocity, self.replicas)
         candidates = self._select_candidates(kicked, pairs, duration, bound)
         progress = execute_impacts(
             kicked, listed, candidates, scene, duration, self.contact_time, self.all_elastic
         )
         new = self._state_after_window(kicked, candidates, progress, duration)
-        new = self._apply_drive(new, duration, 1.0)
+        new = kick_at_end(new, scene, duration)
         new = advance_to_end(new, duration, end, is_last)
 
         fault, repeat = self._judge(new, listed, candidates, progress, bound)
@@ -396,36 +392,6 @@ class HardDynamics(AbstractSphereDynamics):
             status=state.status & FATAL,
         )
 
-    def _apply_drive(self, state: SphereState, duration: ArrayLike, place: float) -> SphereState:
-        """Return the state with half of the kicks of a window, at its begin (place 0) or end (1).
-
-        Time and window are those before the window; the velocities may already have had kicks.
-        """
-        counted_key = state.internal.key
-        replicas = self.replicas
-        if counted_key is None:
-            return state
-        variance = drive_variance(self.scene, state.time + state.time_rest, duration, place)
-        key = jax.random.fold_in(threefry_key(counted_key[:2]), counted_key[2])
-        velocity = by_replica(state.velocity, replicas)
-        kicks = jax.vmap(random_kicks, (0, 0, None))(
-            jax.random.split(key, replicas), velocity, self.scene.container is None
-        )
-        velocity = (velocity + jnp.sqrt(variance) * kicks).reshape(state.velocity.shape)
-        internal = state.internal._replace(key=counted_key.at[2].add(jnp.uint32(1)))
-        return state._replace(velocity=velocity, internal=internal)
-
-    def _longest_window(self, state: SphereState) -> Float[Array, ""]:
-        """Return a length with which the kicks of a window are small beside the velocities."""
-        if self.scene.material.drive is None:
-            return state.internal.window
-        lowest = jnp.min(temperature(state.velocity, self.replicas))
-        time = state.time
-        growth = 2 * drive_variance(self.scene, time + state.time_rest, jnp.ones_like(lowest), 0.0)
-        safe_growth = jnp.where(growth > 0, growth, 1.0)
-        longest = jnp.where(growth > 0, MAX_KICK * lowest / safe_growth, jnp.inf)
-        return jnp.minimum(state.internal.window, longest)
-
     def _tangents_after(
         self,
         kicked: SphereState,
@@ -462,15 +428,8 @@ class HardDynamics(AbstractSphereDynamics):
         by_direction = by_change[:-num_energies]
         by_scale = by_change[-num_energies:]
         if material.drive is not None:
-
-            def heating(material: ReducedScene) -> Array:
-                changed = scene._replace(material=material)
-                start = kicked.time + kicked.time_rest
-                first, second = (drive_variance(changed, start, duration, k) for k in (0.0, 1.0))
-                return kicked.velocity.size / replicas / 2 * (first + second)
-
-            heat, linear = jax.linearize(heating, material)
-            by_direction = by_direction.at[:, 0].add(jax.vmap(linear)(tangents.directions)[:, None])
+            heat, heat_slopes = heat_of_kicks(kicked, scene, duration, tangents.directions)
+            by_direction = by_direction.at[:, 0].add(heat_slopes[:, None])
             # Heating does not depend on the speeds, unlike the frequency of impacts.
             by_scale = by_scale.at[0, 0].add(-heat)
             gained[0] = gained[0] + heat
@@ -493,14 +452,6 @@ def allowed_overlap(dtype: Any, side: Any) -> Any:
     It is at least the overlap of spheres in contact by rounding of positions.
     """
     return jnp.maximum(ALLOWED_OVERLAP, 10 * side * jnp.finfo(dtype).eps)
-
-
-def drive_variance(
-    scene: SphereScene, start: Float[Array, ""], duration: ArrayLike, place: float
-) -> Float[Array, ""]:
-    """Return the variance of half of the kicks of a window, at its begin (place 0) or end (1)."""
-    strength = scene.material.drive * scene.collision_frequency
-    return kick_growth(strength, scene.drag_rates, start, jnp.asarray(duration), place)
 
 
 def _window_sums(
