@@ -2,7 +2,8 @@
 
 - `prediction`: the next impact of each pair, on walls too, and until when each path is final.
 - `impacts`: the effect of impacts, and its derivatives.
-- `window`: the execution of all impacts of a window.
+- `window`: the execution of all impacts of a window, and their sums.
+- `window_length`: how long windows are.
 - `drive`: random kicks at both ends of a window, and their heat.
 - `dynamics`: the sequence of windows, with tangents.
 - `records`: what a run records of its states.

@@ -29,7 +29,13 @@ from jaxgran.particles.hard.drive import (
 )
 from jaxgran.particles.hard.prediction import ImpactCandidates, PairRows, Paths, first_impacts
 from jaxgran.particles.hard.records import hard_records
-from jaxgran.particles.hard.window import MAX_ROUNDS, WindowProgress, execute_impacts
+from jaxgran.particles.hard.window import (
+    MAX_ROUNDS,
+    WindowProgress,
+    WindowSums,
+    execute_impacts,
+)
+from jaxgran.particles.hard.window_length import WindowController
 from jaxgran.particles.neighbours.pairs import Pairs
 from jaxgran.particles.neighbours.selection import select_members
 from jaxgran.particles.spheres import (
@@ -46,24 +52,6 @@ from jaxgran.particles.spheres import (
 from jaxgran.particles.start import initial_spins
 from jaxgran.scene.geometry import wrap
 from jaxgran.scene.reduced import ReducedScene, SphereScene
-
-FIRST_WINDOW = 0.125
-"""Length of the first window, over that with the wanted impacts at the rate of a gas.
-
-It is short, as many spheres are near contact at random positions.
-"""
-
-MIN_IMPACTS = 8
-"""Smallest number of impacts that a window should have, in all replicas together."""
-
-WINDOW_EXPONENT = 0.3
-"""Damping exponent of the window-length controller.
-
-The length changes by ``(wanted / executed impacts)^0.3``, as the number of impacts scatters.
-"""
-
-MIN_CHANGE, MAX_CHANGE = 0.5, 1.5
-"""Least and largest ratio of the lengths of two successive windows by that controller."""
 
 SPEED_MARGIN = 1.15
 """Bound on the speeds within a window, over the speed of the fastest sphere before it."""
@@ -107,15 +95,6 @@ class HardState(NamedTuple):
     key: UInt32[Array, "3"] | None = None
 
 
-class WindowSums(NamedTuple):
-    """Sums of the fields of `WindowProgress` with the same names over the slots of each replica."""
-
-    dissipated: Float[Array, "replicas"]
-    rotational_gain: Float[Array, "replicas"] | None
-    num_impacts: Int[Array, "replicas"]
-    regularised: Int[Array, "replicas"]
-
-
 class HardDynamics(AbstractSphereDynamics):
     """Hard spheres in windows of time.
 
@@ -139,8 +118,13 @@ class HardDynamics(AbstractSphereDynamics):
     contact_time: Float[Array, ""]
     all_elastic: Bool[Array, ""]
 
+    @property
+    def window_lengths(self) -> WindowController:
+        """The controller of the lengths of windows."""
+        return WindowController(self.share, self.replicas * self.shape[1])
+
     def elastic(self) -> "HardDynamics":
-        """Return the dynamics of smooth elastic spheres, between such walls, without drag.
+        """Return the dynamics of smooth elastic spheres between such walls, without drag or drive.
 
         Zero drag and a zero law keep the structure of a run of smooth spheres, whose compiled
         program is reused.
@@ -149,32 +133,37 @@ class HardDynamics(AbstractSphereDynamics):
         walls = material.walls
         if walls is not None:
             walls = walls._replace(surface=None)
-        law, drag = jax.tree.map(lambda x: 0 * x, (material.law, material.drag))
-        material = material._replace(law=law, surface=None, walls=walls, drag=drag, drive=None)
+        material = material._replace(
+            law=jax.tree.map(lambda x: 0 * x, material.law),
+            surface=None,
+            walls=walls,
+            drag=jax.tree.map(lambda x: 0 * x, material.drag),
+            drive=None,
+        )
         scene = self.scene._replace(material=material)
         return dataclasses.replace(self, scene=scene, all_elastic=jnp.ones((), bool))
 
     def initial_internal(self, velocity: Float[Array, "n d"], key: PRNGKeyArray) -> HardState:
         dtype = velocity.dtype
         material = self.scene.material
-        rate = self.scene.collision_frequency
-        if self.region is not None:
-            rate = rate + 2 / jnp.min(self.region)
+        frequency = self.scene.collision_frequency
+        if self.region is not None:  # impacts on walls
+            frequency = frequency + 2 / jnp.min(self.region)
         spin = None
-        gain = None
+        rotational_gain = None
         kick_key = None
         if material.surface is not None:
             mean_square = (material.surface.ratio / material.surface.inertia).astype(dtype)
             spin = initial_spins(key, self.shape, mean_square)
-            gain = jnp.zeros(self.replicas, dtype)
+            rotational_gain = jnp.zeros(self.replicas, dtype)
         if material.drive is not None:
             kick_key = initial_kick_key(key)
         return HardState(
             age=jnp.full(len(velocity), jnp.inf, dtype),
             regularised=jnp.zeros(self.replicas, jnp.result_type(int)),
-            window=jnp.asarray(FIRST_WINDOW * self.share / rate, dtype),
+            window=jnp.asarray(self.window_lengths.first(frequency), dtype),
             spin=spin,
-            rotational_gain=gain,
+            rotational_gain=rotational_gain,
             key=kick_key,
         )
 
@@ -234,7 +223,8 @@ class HardDynamics(AbstractSphereDynamics):
         old = now.state
         bound_factor = now.retry
         scene = self.scene
-        longest = jnp.minimum(old.internal.window, longest_window(old, scene))
+        window = old.internal.window
+        longest = jnp.minimum(window, longest_window(old, scene))
         duration, is_last = next_block(old, longest, end)
         kicked = kick_at_start(old, scene, duration)
         bound = SPEED_MARGIN * bound_factor * fastest(kicked.velocity, self.replicas)
@@ -242,21 +232,30 @@ class HardDynamics(AbstractSphereDynamics):
         progress = execute_impacts(
             kicked, listed, candidates, scene, duration, self.contact_time, self.all_elastic
         )
-        new = self._state_after_window(kicked, candidates, progress, duration)
+        new = self._after_impacts(kicked, candidates, progress, duration)
         new = kick_at_end(new, scene, duration)
         new = advance_to_end(new, duration, end, is_last)
+        next_window = self.window_lengths.after(window, duration, progress.total_impacts)
+        new = new._replace(internal=new.internal._replace(window=next_window))
 
         fault, repeat = self._judge(new, listed, candidates, progress, bound)
         accepted = (fault == status.OK) & ~repeat
         state = jax.tree.map(partial(jnp.where, accepted), new, old)
-        next_duration = jnp.minimum(state.internal.window, time_left(state, end))
-        next_position = state.position + state.velocity * next_duration
-        next_distance2 = jnp.max(jnp.sum((next_position - listed) ** 2, -1))
+        needed = jnp.maximum(old.needed, candidates.needed)
         return Segment(
-            state=state._replace(status=fault, needed=jnp.maximum(old.needed, candidates.needed)),
-            stale=accepted & (next_distance2 > (0.5 * old.skin) ** 2),
+            state=state._replace(status=fault, needed=needed),
+            stale=accepted & self._will_leave_skin(state, listed, end),
             retry=jnp.where(repeat, BOUND_GROWTH * bound_factor, 1.0),
         )
+
+    def _will_leave_skin(
+        self, state: SphereState, listed: Float[Array, "n d"], end: ArrayLike
+    ) -> Bool[Array, ""]:
+        """Return whether free flight in the next window makes the neighbour list stale."""
+        duration = jnp.minimum(state.internal.window, time_left(state, end))
+        position = state.position + state.velocity * duration
+        distance2 = jnp.max(jnp.sum((position - listed) ** 2, -1))
+        return distance2 > (0.5 * state.skin) ** 2
 
     def _judge(
         self,
@@ -324,56 +323,85 @@ class HardDynamics(AbstractSphereDynamics):
         )
         return ImpactCandidates(found.members, rows, found.members // size, needed)
 
-    def _state_after_window(
+    def _after_impacts(
         self,
         state: SphereState,
         candidates: ImpactCandidates,
         progress: WindowProgress,
         duration: Array,
     ) -> SphereState:
-        """Return the state after a window at its old time, with the length of the next window."""
+        """Return the state after the impacts of a window, with the time at its start.
 
-        def to_members(values, new):
-            return values.at[candidates.members].set(new, mode="drop")
+        Args:
+            state: at the start of the window, after the first half of the kicks.
+            candidates: pairs and particles of the window.
+            progress: after the last impact.
+            duration: of the window.
+        """
 
-        sums = _window_sums(candidates, progress, self.replicas)
-        impacts = sums.num_impacts // 2
-        lost = sums.dissipated
-        wanted = max(0.5 * self.share * len(state.position), MIN_IMPACTS)
-        num_in_window = jnp.sum(impacts).astype(lost.dtype)
-        if progress.num_wall_impacts is not None:  # each of one sphere, not of two
-            num_on_walls = jnp.sum(progress.num_wall_impacts).astype(lost.dtype)
-            num_in_window = num_in_window + num_on_walls / 2
-        ratio = (wanted / jnp.maximum(num_in_window, 1)) ** WINDOW_EXPONENT
-        ratio = jnp.clip(ratio, MIN_CHANGE, MAX_CHANGE)
+        def with_members(values: Array, of_members: Any) -> Array:
+            return values.at[candidates.members].set(of_members, mode="drop")
+
         paths = progress.paths
+        sums = progress.sums(candidates, self.replicas)
+        flown = state.position + state.velocity * duration
         internal = state.internal
-        more = sums.regularised.astype(internal.regularised.dtype) // 2
-        regularised = internal.regularised + more
+        more_regularised = sums.regularised.astype(internal.regularised.dtype)
+        spin = None
         rotational_gain = None
-        if sums.rotational_gain is not None:
+        tangents = None
+        if internal.spin is not None:
+            spin = with_members(internal.spin, paths.spin)
             rotational_gain = internal.rotational_gain + sums.rotational_gain
-        # The last, short window before an end says nothing about the rate of impacts.
-        full_length = duration > 0.5 * internal.window
-        new = state._replace(
-            position=to_members(
-                state.position + state.velocity * duration, paths.x + paths.v * duration
-            ),
-            velocity=to_members(state.velocity, paths.v),
-            dissipated=state.dissipated + lost,
-            collisions=state.collisions + impacts.astype(state.collisions.dtype),
+        if state.tangents is not None:
+            tangents = self._tangents_after(state, sums, duration)
+        return state._replace(
+            position=with_members(flown, paths.x + paths.v * duration),
+            velocity=with_members(state.velocity, paths.v),
+            dissipated=state.dissipated + sums.dissipated,
+            collisions=state.collisions + sums.collisions.astype(state.collisions.dtype),
             internal=internal._replace(
-                age=to_members(internal.age + duration, duration - paths.last),
-                regularised=regularised,
-                window=jnp.where(full_length, duration * ratio, internal.window),
-                spin=None if internal.spin is None else to_members(internal.spin, paths.spin),
+                age=with_members(internal.age + duration, duration - paths.last),
+                regularised=internal.regularised + more_regularised,
+                spin=spin,
                 rotational_gain=rotational_gain,
             ),
+            tangents=tangents,
         )
-        if state.tangents is None:
-            return new
-        return new._replace(
-            tangents=self._tangents_after(state, candidates, progress.gains, sums, duration)
+
+    def _tangents_after(
+        self, state: SphereState, sums: WindowSums, duration: Array
+    ) -> ExchangeTangents:
+        """Return the tangents after a window, with the heat of its kicks.
+
+        Args:
+            state: at the start of the window, after the first half of the kicks.
+            sums: over the impacts of the window.
+            duration: of the window.
+        """
+        tangents = state.tangents
+        material = self.scene.material
+        before = [kinetic_energy(state.velocity, self.replicas)]
+        gained = [-sums.dissipated]
+        if sums.rotational_gain is not None:
+            spin_energy = kinetic_energy(state.internal.spin, self.replicas)
+            before.append(material.surface.inertia * spin_energy)
+            gained.append(sums.rotational_gain)
+        num_energies = len(gained)
+        by_direction = sums.gains[:-num_energies]
+        by_scale = sums.gains[-num_energies:]
+        if material.drive is not None:
+            heat, slopes = heat_of_kicks(state, self.scene, duration, tangents.directions)
+            gained[0] = gained[0] + heat
+            by_direction = by_direction.at[:, 0].add(slopes[:, None])
+            # Heating does not depend on the speeds, unlike the frequency of impacts.
+            by_scale = by_scale.at[0, 0].add(-heat)
+        return tangents.after(
+            jnp.stack(before),
+            jnp.stack(gained),
+            by_direction,
+            by_scale,
+            sums.collisions.astype(sums.gains.dtype),
         )
 
     def recover(self, now: Segment, before: SphereState) -> SphereState:
@@ -392,55 +420,12 @@ class HardDynamics(AbstractSphereDynamics):
             status=state.status & FATAL,
         )
 
-    def _tangents_after(
-        self,
-        kicked: SphereState,
-        candidates: ImpactCandidates,
-        gains: Float[Array, "changes energies rows"],
-        sums: WindowSums,
-        duration: Array,
-    ) -> ExchangeTangents:
-        """Return the tangents after a window.
-
-        Args:
-            kicked: state after the first half of the kicks.
-            candidates: pairs and particles of the window.
-            gains: of the energy in their impacts, `WindowProgress.gains`.
-            sums: over the impacts of the window.
-            duration: of the window.
-        """
-        tangents = kicked.tangents
-        scene = self.scene
-        replicas = self.replicas
-        material = scene.material
-        replica = candidates.replica
-        of_gains = replica[candidates.rows.a]
-        if scene.container is not None:
-            of_gains = jnp.concatenate([of_gains, replica])
-        by_change = jnp.zeros((*gains.shape[:-1], replicas), gains.dtype)
-        by_change = by_change.at[..., of_gains].add(gains, mode="drop")
-        before = [kinetic_energy(kicked.velocity, replicas)]
-        gained = [-sums.dissipated]
-        if sums.rotational_gain is not None:
-            before.append(material.surface.inertia * kinetic_energy(kicked.internal.spin, replicas))
-            gained.append(sums.rotational_gain)
-        num_energies = len(gained)
-        by_direction = by_change[:-num_energies]
-        by_scale = by_change[-num_energies:]
-        if material.drive is not None:
-            heat, heat_slopes = heat_of_kicks(kicked, scene, duration, tangents.directions)
-            by_direction = by_direction.at[:, 0].add(heat_slopes[:, None])
-            # Heating does not depend on the speeds, unlike the frequency of impacts.
-            by_scale = by_scale.at[0, 0].add(-heat)
-            gained[0] = gained[0] + heat
-        return tangents.after(
-            jnp.stack(before), jnp.stack(gained), by_direction, by_scale, sums.num_impacts / 2
-        )
-
     def true_velocities(self, state: SphereState) -> tuple[Array, Array | None]:
         decay = drag_decay(self.scene.drag_rates, state.time + state.time_rest)
         spin = state.internal.spin
-        return state.velocity * decay.velocity, None if spin is None else spin * decay.spin
+        if spin is not None:
+            spin = spin * decay.spin
+        return state.velocity * decay.velocity, spin
 
     def observe(self, state: SphereState) -> Records:
         return hard_records(state, self.scene, self.replicas)
@@ -452,21 +437,3 @@ def allowed_overlap(dtype: Any, side: Any) -> Any:
     It is at least the overlap of spheres in contact by rounding of positions.
     """
     return jnp.maximum(ALLOWED_OVERLAP, 10 * side * jnp.finfo(dtype).eps)
-
-
-def _window_sums(
-    candidates: ImpactCandidates, progress: WindowProgress, replicas: int
-) -> WindowSums:
-    """Return the sums over the slots of each replica; an empty slot belongs to none."""
-
-    def total(values: Array) -> Array:
-        sums = jnp.zeros(replicas, values.dtype)
-        return sums.at[candidates.replica].add(values, mode="drop")
-
-    gain = progress.rotational_gain
-    return WindowSums(
-        dissipated=total(progress.dissipated),
-        rotational_gain=None if gain is None else total(gain),
-        num_impacts=total(progress.num_impacts),
-        regularised=total(progress.regularised),
-    )
