@@ -16,10 +16,10 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, UInt32
 from jaxgran._utils import status
 from jaxgran.gradients.rule import Records
 from jaxgran.gradients.tangents import ExchangeTangents
-from jaxgran.particles.bit_masks import rows_where
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import time_left
 from jaxgran.particles.elements import drag_decay
+from jaxgran.particles.hard.candidates import ImpactCandidates, select_candidates
 from jaxgran.particles.hard.drive import (
     heat_of_kicks,
     initial_kick_key,
@@ -27,7 +27,6 @@ from jaxgran.particles.hard.drive import (
     kick_at_start,
     longest_window,
 )
-from jaxgran.particles.hard.prediction import ImpactCandidates, PairRows, Paths, first_impacts
 from jaxgran.particles.hard.records import hard_records
 from jaxgran.particles.hard.window import (
     MAX_ROUNDS,
@@ -37,7 +36,6 @@ from jaxgran.particles.hard.window import (
 )
 from jaxgran.particles.hard.window_length import WindowController
 from jaxgran.particles.neighbours.pairs import Pairs
-from jaxgran.particles.neighbours.selection import select_members
 from jaxgran.particles.spheres import (
     FATAL,
     AbstractSphereDynamics,
@@ -228,7 +226,9 @@ class HardDynamics(AbstractSphereDynamics):
         duration, is_last = next_block(old, longest, end)
         kicked = kick_at_start(old, scene, duration)
         bound = SPEED_MARGIN * bound_factor * fastest(kicked.velocity, self.replicas)
-        candidates = self._select_candidates(kicked, pairs, duration, bound)
+        candidates = select_candidates(
+            kicked, scene.container, pairs, self.capacity, duration, bound
+        )
         progress = execute_impacts(
             kicked, listed, candidates, scene, duration, self.contact_time, self.all_elastic
         )
@@ -278,50 +278,6 @@ class HardDynamics(AbstractSphereDynamics):
         other |= status.flag(status.STALLED, progress.num_rounds >= MAX_ROUNDS)
         fault = jnp.where(invalid > 0, invalid, jnp.where(too_fast, status.OK, other))
         return fault.astype(jnp.int32), too_fast & (invalid == 0)
-
-    def _select_candidates(
-        self, state: SphereState, pairs: Pairs, duration: Array, bound: Float[Array, "replicas"]
-    ) -> ImpactCandidates:
-        """Select the pairs that touch in free flight, and all that may touch once paths have
-        changed. Particles that reach a wall are members, too.
-
-        Args:
-            state: at the beginning of the window.
-            pairs: a neighbour list, with all pairs that may touch.
-            duration: of the window.
-            bound: an upper bound on the speeds in each replica during the window.
-        """
-        x = state.position
-        v = state.velocity
-        container = self.scene.container
-        n = len(x)
-        size = self.shape[1]
-        # The listed pairs that can touch at the largest speeds are a small part of the list.
-        displacement = x[pairs.i] - x[pairs.j] - pairs.offset
-        gap = jnp.sqrt(jnp.sum(displacement * displacement, -1)) - 1
-        gap = jnp.where(pairs.in_use, gap, jnp.inf)
-        is_near = gap < 2 * bound[pairs.i // size] * duration
-        near, real, num_near = rows_where(is_near, self.capacity.near)
-        i = pairs.i[near]
-        j = pairs.j[near]
-        offset = pairs.offset[near]
-        rows = PairRows(i, j, offset, bound[i // size], real)
-
-        free = first_impacts(Paths(x, v, jnp.zeros(n, x.dtype)), rows, duration, container)
-        disturbed = jnp.minimum(jnp.minimum(free.final[i], free.final[j]), duration)
-        closer = free.motion.gap(disturbed) < 2 * rows.bound * (duration - disturbed)
-        selected = rows.real & (jnp.isfinite(free.times) | closer)
-        at_walls = jnp.zeros(n, bool) if free.walls is None else jnp.isfinite(free.walls.times)
-        max_rows = self.capacity.contacts
-        max_members = self.capacity.members
-        found = select_members(selected, i, j, at_walls, max_rows=max_rows, max_members=max_members)
-        rows = PairRows(
-            found.first, found.second, offset[found.rows], rows.bound[found.rows], found.real
-        )
-        needed = jnp.stack(
-            [pairs.count, pairs.lookahead, num_near, found.num_rows, found.num_members]
-        )
-        return ImpactCandidates(found.members, rows, found.members // size, needed)
 
     def _after_impacts(
         self,

@@ -2,7 +2,7 @@
 
 The arrays of a window have a row for each pair that may touch, and a slot for each sphere that may
 be hit in the window, on another sphere or on a wall. A slot holds one sphere; further slots at the
-end of the arrays are empty (`jaxgran.particles.hard.prediction.ImpactCandidates`). Units as in
+end of the arrays are empty (`jaxgran.particles.hard.candidates.ImpactCandidates`). Units as in
 `jaxgran.particles.hard.impacts`.
 """
 
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxgran.gradients.tangents import ExchangeTangents
+from jaxgran.particles.hard.candidates import ImpactCandidates
 from jaxgran.particles.hard.impacts import (
     ImpactEffect,
     ImpactEvents,
@@ -23,7 +24,6 @@ from jaxgran.particles.hard.impacts import (
 )
 from jaxgran.particles.hard.prediction import (
     FirstImpacts,
-    ImpactCandidates,
     PairRows,
     Paths,
     WallImpacts,
