@@ -54,7 +54,7 @@ def kick_at_end(state: SphereState, scene: SphereScene, duration: ArrayLike) -> 
     return _kicked(state, scene, _growth_in_window(state, scene, duration).at_end)
 
 
-def longest_window(state: SphereState, scene: SphereScene) -> Float[Array, ""]:
+def window_of_small_kicks(state: SphereState, scene: SphereScene) -> Float[Array, ""]:
     """Return the duration in which the coldest replica is heated by the share `MAX_KICK`.
 
     It is infinite without a drive.

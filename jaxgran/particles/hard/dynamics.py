@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, UInt32
+from jaxtyping import Array, ArrayLike, Bool, DTypeLike, Float, Int, PRNGKeyArray, UInt32
 
 from jaxgran._utils import status
 from jaxgran.gradients.rule import Records
@@ -25,7 +25,7 @@ from jaxgran.particles.hard.drive import (
     initial_kick_key,
     kick_at_end,
     kick_at_start,
-    longest_window,
+    window_of_small_kicks,
 )
 from jaxgran.particles.hard.records import hard_records
 from jaxgran.particles.hard.window import (
@@ -99,7 +99,7 @@ class HardDynamics(AbstractSphereDynamics):
     Attributes:
         scene, shape, capacity, equilibration_capacity, listed_by_skin, engine, compiled_engine: see
             `AbstractSphereDynamics`.
-        share: impacts per particle in a window.
+        share: wanted impacts of a sphere in a window.
         contact_time: in mean free times; the impact of a sphere within this time of its last one is
             elastic.
         all_elastic: whether all impacts are elastic and smooth.
@@ -122,7 +122,7 @@ class HardDynamics(AbstractSphereDynamics):
         return WindowController(self.share, self.replicas * self.shape[1])
 
     def elastic(self) -> "HardDynamics":
-        """Return the dynamics of smooth elastic spheres between such walls, without drag or drive.
+        """Return the dynamics of smooth elastic spheres and walls, without drag or a drive.
 
         Zero drag and a zero law keep the structure of a run of smooth spheres, whose compiled
         program is reused.
@@ -196,8 +196,11 @@ class HardDynamics(AbstractSphereDynamics):
             state.fresh, lambda: self._overlaps(state, pairs), lambda: jnp.zeros((), bool)
         )
         fault = state.status | status.flag(status.OVERLAPPING, overlapping)
-        bound_factor = jnp.ones((), state.position.dtype)
-        first = Segment(state._replace(status=fault), jnp.zeros((), bool), bound_factor)
+        first = Segment(
+            state=state._replace(status=fault),
+            stale=jnp.zeros((), bool),
+            retry=jnp.ones((), state.position.dtype),
+        )
         window = partial(self._run_window, listed=listed, pairs=pairs, end=end)
         return repeat_until(end, window, first)
 
@@ -222,7 +225,7 @@ class HardDynamics(AbstractSphereDynamics):
         bound_factor = now.retry
         scene = self.scene
         window = old.internal.window
-        longest = jnp.minimum(window, longest_window(old, scene))
+        longest = jnp.minimum(window, window_of_small_kicks(old, scene))
         duration, is_last = next_block(old, longest, end)
         kicked = kick_at_start(old, scene, duration)
         bound = SPEED_MARGIN * bound_factor * fastest(kicked.velocity, self.replicas)
@@ -247,37 +250,6 @@ class HardDynamics(AbstractSphereDynamics):
             stale=accepted & self._will_leave_skin(state, listed, end),
             retry=jnp.where(repeat, BOUND_GROWTH * bound_factor, 1.0),
         )
-
-    def _will_leave_skin(
-        self, state: SphereState, listed: Float[Array, "n d"], end: ArrayLike
-    ) -> Bool[Array, ""]:
-        """Return whether free flight in the next window makes the neighbour list stale."""
-        duration = jnp.minimum(state.internal.window, time_left(state, end))
-        position = state.position + state.velocity * duration
-        distance2 = jnp.max(jnp.sum((position - listed) ** 2, -1))
-        return distance2 > (0.5 * state.skin) ** 2
-
-    def _judge(
-        self,
-        new: SphereState,
-        listed: Float[Array, "n d"],
-        candidates: ImpactCandidates,
-        progress: WindowProgress,
-        bound: Float[Array, "replicas"],
-    ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
-        """Return the faults of a window, and whether it is repeated with a larger bound on speeds.
-
-        A window that lacks pairs or is not finite has that fault alone; one that is repeated, none.
-        """
-        distance2 = jnp.max(jnp.sum((new.position - listed) ** 2, -1))
-        exceeded = jnp.maximum(distance2, jnp.max(progress.max_distance2)) > (0.5 * new.skin) ** 2
-        member_bound = bound[jnp.minimum(candidates.replica, self.replicas - 1)]
-        too_fast = jnp.any(progress.max_speed2 > member_bound**2)
-        invalid = self.invalid_block(new, candidates.needed)
-        other = status.flag(status.SKIN_EXCEEDED, exceeded)
-        other |= status.flag(status.STALLED, progress.num_rounds >= MAX_ROUNDS)
-        fault = jnp.where(invalid > 0, invalid, jnp.where(too_fast, status.OK, other))
-        return fault.astype(jnp.int32), too_fast & (invalid == 0)
 
     def _after_impacts(
         self,
@@ -360,6 +332,38 @@ class HardDynamics(AbstractSphereDynamics):
             sums.collisions.astype(sums.gains.dtype),
         )
 
+    def _judge(
+        self,
+        new: SphereState,
+        listed: Float[Array, "n d"],
+        candidates: ImpactCandidates,
+        progress: WindowProgress,
+        bound: Float[Array, "replicas"],
+    ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+        """Return the faults of a window, and whether to repeat it with a larger bound on speeds."""
+        distance2 = jnp.max(jnp.sum((new.position - listed) ** 2, -1))
+        distance2 = jnp.maximum(distance2, jnp.max(progress.max_distance2))
+        left_skin = distance2 > (0.5 * new.skin) ** 2
+        member_bound = bound[jnp.minimum(candidates.replica, self.replicas - 1)]
+        too_fast = jnp.any(progress.max_speed2 > member_bound**2)
+        invalid = self.invalid_block(new, candidates.needed)
+        repeat = too_fast & (invalid == 0)
+        fault = status.flag(status.SKIN_EXCEEDED, left_skin)
+        fault |= status.flag(status.STALLED, progress.num_rounds >= MAX_ROUNDS)
+        # A window to be repeated has no fault; one that lacks pairs or is not finite, that alone.
+        fault = jnp.where(repeat, status.OK, fault)
+        fault = jnp.where(invalid > 0, invalid, fault)
+        return fault.astype(jnp.int32), repeat
+
+    def _will_leave_skin(
+        self, state: SphereState, listed: Float[Array, "n d"], end: ArrayLike
+    ) -> Bool[Array, ""]:
+        """Return whether free flight in the next window makes the neighbour list stale."""
+        duration = jnp.minimum(state.internal.window, time_left(state, end))
+        position = state.position + state.velocity * duration
+        distance2 = jnp.max(jnp.sum((position - listed) ** 2, -1))
+        return distance2 > (0.5 * state.skin) ** 2
+
     def recover(self, now: Segment, before: SphereState) -> SphereState:
         """Shorten the window if the skin was exceeded at once, and the skin of a crowded list."""
         state = now.state
@@ -387,7 +391,7 @@ class HardDynamics(AbstractSphereDynamics):
         return hard_records(state, self.scene, self.replicas)
 
 
-def allowed_overlap(dtype: Any, side: Any) -> Any:
+def allowed_overlap(dtype: DTypeLike, side: ArrayLike) -> Array:
     """Return the overlap up to which spheres of a start count as hard.
 
     It is at least the overlap of spheres in contact by rounding of positions.

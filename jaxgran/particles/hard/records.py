@@ -1,6 +1,7 @@
-"""Records of hard spheres: true values from the stored ones, without drag, and their derivatives.
+"""Records of hard spheres, and their derivatives.
 
-Units as in `jaxgran.particles.hard.impacts`.
+A run stores velocities and spins without their decay by drag (`jaxgran.particles.elements`); the
+records are of the true ones. Units as in `jaxgran.particles.hard.impacts`.
 """
 
 from functools import partial
@@ -78,12 +79,12 @@ def _energy_lost(
     n, d = state.velocity.shape
     size = n // replicas
     first = kinetic_energy(state.first_velocity, replicas) / size
-    kept = decay.velocity**2 * (first - state.dissipated / size)
-    lost = first - kept
+    now = decay.velocity**2 * (first - state.dissipated / size)
+    lost = first - now
     if state.internal.spin is not None:
-        first = NUM_SPIN_COMPONENTS[d] / 2 * material.surface.ratio
-        kept = decay.spin**2 * (first + state.internal.rotational_gain / size)
-        lost = lost + first - kept
+        first_of_spins = NUM_SPIN_COMPONENTS[d] / 2 * material.surface.ratio
+        now_of_spins = decay.spin**2 * (first_of_spins + state.internal.rotational_gain / size)
+        lost = lost + first_of_spins - now_of_spins
     if material.drive is not None:
         dragged = (decay.velocity < 1) | (decay.spin < 1)
         lost = jnp.where(dragged & (material.drive > 0), jnp.nan, lost)

@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 
 import jaxgran
-from jaxgran.particles.hard.drive import heat_of_kicks, kick_at_end, kick_at_start, longest_window
+from jaxgran.particles.hard.drive import (
+    heat_of_kicks,
+    kick_at_end,
+    kick_at_start,
+    window_of_small_kicks,
+)
 from jaxgran.particles.spheres import temperature
 from tests.beads import hard_gas, lattice
 
@@ -53,7 +58,7 @@ def test_each_half_of_the_kicks_heats_as_much_as_it_should(drag_rate):
     np.testing.assert_allclose(np.var(first), of_first, rtol=0.055)
     np.testing.assert_allclose(np.var(second), of_second, rtol=0.055)
     heat, slopes = heat_of_kicks(state, scene, DURATION, directions_like(scene.material))
-    # In drag's flight the duration also has a term of order DURATION^2.
+    # The true duration has terms of higher order in DURATION.
     np.testing.assert_allclose(heat, 3 * N / 2 * (of_first + of_second), rtol=0.01)
     np.testing.assert_allclose(slopes, [heat], rtol=1e-12)
 
@@ -62,12 +67,12 @@ def test_a_window_is_as_short_as_the_coldest_replica_needs():
     scene, state = driven()
     cold = state._replace(velocity=state.velocity.at[:N].multiply(0.5))
     coldest = temperature(cold.velocity, 2)[0]
-    np.testing.assert_allclose(longest_window(cold, scene) * STRENGTH, 0.05 * coldest)
+    np.testing.assert_allclose(window_of_small_kicks(cold, scene) * STRENGTH, 0.05 * coldest)
 
 
-def test_without_kicks_windows_are_as_long_as_they_like():
+def test_where_nothing_is_kicked_windows_have_no_limit():
     weakest, state = driven(strength=0.0)
     without = weakest._replace(material=weakest.material._replace(drive=None))
     for scene in (weakest, without):
-        assert longest_window(state, scene) == np.inf
+        assert window_of_small_kicks(state, scene) == np.inf
         np.testing.assert_array_equal(kick_at_end(state, scene, DURATION).velocity, state.velocity)
