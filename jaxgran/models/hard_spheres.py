@@ -21,12 +21,12 @@ from jaxgran.models.spheres import AbstractSpheres
 from jaxgran.particles.capacity import capacities
 from jaxgran.particles.hard.dynamics import (
     ALLOWED_OVERLAP,
-    MIN_IMPACTS,
     SPEED_MARGIN,
     HardDynamics,
     allowed_overlap,
 )
 from jaxgran.particles.hard.impacts import LawOfReplicas
+from jaxgran.particles.hard.window_length import MIN_IMPACTS
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import wrap_on_host
 from jaxgran.scene.reduced import SphereScene, reduced_scene, sphere_scene

@@ -140,10 +140,22 @@ MAX_KICK = 0.05
 """Largest relative growth of T by the kicks of one step."""
 
 
+class KickGrowth(NamedTuple):
+    """Growth of T by the kicks of one step.
+
+    Attributes:
+        at_start: by the half of the kicks at the start of the step.
+        at_end: by the half at its end.
+    """
+
+    at_start: Float[Array, "..."]
+    at_end: Float[Array, "..."]
+
+
 def kick_growth(
-    strength: Array, drag: ReducedDrag | None, start: Array, duration: Array, place: float
-) -> Array:
-    """Return the growth of T by half of the kicks of a step.
+    strength: Array, drag: ReducedDrag | None, start: Array, duration: Array
+) -> KickGrowth:
+    """Return the growth of T by the kicks of a step.
 
     With drag it is the growth for the stored velocities u, which do not decay. A kick of v at a
     time t is a kick of u that is ``exp(gamma t)`` times as large.
@@ -153,12 +165,14 @@ def kick_growth(
         drag: rates of drag; None without drag.
         start: time at which the step begins; transformed with drag.
         duration: of the step; transformed with drag. A negative one counts as 0.
-        place: where in the step the kicks are: 0 at its start, 1 at its end.
     """
     if drag is None:
-        return strength * jnp.maximum(duration, 0.0) / 2
-    time = true_duration(drag, start, duration)
-    return strength * time / 2 / drag_decay(drag, start + place * duration).velocity ** 2
+        half = strength * jnp.maximum(duration, 0.0) / 2
+        return KickGrowth(half, half)
+    half = strength * true_duration(drag, start, duration) / 2
+    decay_at_start = drag_decay(drag, start)
+    decay_at_end = drag_decay(drag, start + duration)
+    return KickGrowth(half / decay_at_start.velocity**2, half / decay_at_end.velocity**2)
 
 
 def random_kicks(

@@ -419,7 +419,7 @@ class DSMCDynamics(AbstractDynamics):
 
         counts = SubsetCounts()
         if scene.drive is not None:
-            growth = kick_growth(scene.drive, scene.drag, gas.time, ds, 0.0)
+            growth = kick_growth(scene.drive, scene.drag, gas.time, ds).at_start
             safe = jnp.where(gas.temperature > 0, gas.temperature, 1.0)
             counts = counts._replace(kicked=at_least(subsets * growth / (MAX_KICK * safe)))
         if scene.walls is not None:
@@ -545,7 +545,7 @@ class DSMCDynamics(AbstractDynamics):
         scene = self.scene
         d = self.scheme.dimension
         subsets = num_subsets(self.scheme.num_particles)
-        growth = kick_growth(scene.drive, scene.drag, start.time, dt, float(place))
+        growth = kick_growth(scene.drive, scene.drag, start.time, dt)[place]
         key = jax.random.fold_in(key, KICK_STREAMS[place])
         zero_momentum = scene.walls is None
         size = jnp.sqrt(growth / 2 * (subsets / count).astype(growth.dtype))
@@ -710,8 +710,8 @@ class DSMCDynamics(AbstractDynamics):
         if scene.drive is not None:
 
             def heating(scene: ReducedScene) -> Array:
-                kicks = partial(kick_growth, scene.drive, scene.drag, start.time, ds)
-                return self.scheme.num_particles * d / 2 * (kicks(0.0) + kicks(1.0))
+                growth = kick_growth(scene.drive, scene.drag, start.time, ds)
+                return self.scheme.num_particles * d / 2 * (growth.at_start + growth.at_end)
 
             heat, pull = jax.vjp(heating, scene)
             (in_scene,) = pull(jnp.ones_like(heat))

@@ -1,7 +1,7 @@
-"""Dynamics of hard spheres in windows of time, with a drive, records and tangents.
+"""Dynamics of hard spheres in windows of time.
 
-Many impacts are executed at once in each window. White noise drives the spheres by random kicks:
-each window begins and ends with half of its kicks. Units as in `jaxgran.particles.hard.impacts`.
+Many impacts are executed at once in each window. A window begins and ends with half of the kicks of
+a drive. Units as in `jaxgran.particles.hard.impacts`.
 """
 
 import dataclasses
@@ -11,63 +11,45 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, PRNGKeyArray, UInt32
+from jaxtyping import Array, ArrayLike, Bool, DTypeLike, Float, Int, PRNGKeyArray, UInt32
 
 from jaxgran._utils import status
 from jaxgran.gradients.rule import Records
 from jaxgran.gradients.tangents import ExchangeTangents
-from jaxgran.particles.bit_masks import rows_where
 from jaxgran.particles.capacity import Capacity
 from jaxgran.particles.dynamics import time_left
-from jaxgran.particles.elements import (
-    MAX_KICK,
-    drag_decay,
-    exchange_slopes,
-    kick_growth,
-    random_kicks,
-    threefry_key,
+from jaxgran.particles.elements import drag_decay
+from jaxgran.particles.hard.candidates import ImpactCandidates, select_candidates
+from jaxgran.particles.hard.drive import (
+    heat_of_kicks,
+    initial_kick_key,
+    kick_at_end,
+    kick_at_start,
+    window_of_small_kicks,
 )
-from jaxgran.particles.hard.prediction import ImpactCandidates, PairRows, Paths, first_impacts
-from jaxgran.particles.hard.window import MAX_ROUNDS, WindowProgress, execute_impacts
+from jaxgran.particles.hard.records import hard_records
+from jaxgran.particles.hard.window import (
+    MAX_ROUNDS,
+    WindowProgress,
+    WindowSums,
+    execute_impacts,
+)
+from jaxgran.particles.hard.window_length import WindowController
 from jaxgran.particles.neighbours.pairs import Pairs
-from jaxgran.particles.neighbours.selection import select_members
 from jaxgran.particles.spheres import (
     FATAL,
     AbstractSphereDynamics,
     Segment,
     SphereState,
     advance_to_end,
-    by_replica,
-    common_values,
     fastest,
     kinetic_energy,
     next_block,
     repeat_until,
-    temperature,
-    with_dissipated_energy,
 )
 from jaxgran.particles.start import initial_spins
-from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.geometry import wrap
 from jaxgran.scene.reduced import ReducedScene, SphereScene
-
-FIRST_WINDOW = 0.125
-"""Length of the first window, over that with the wanted impacts at the rate of a gas.
-
-It is short, as many spheres are near contact at random positions.
-"""
-
-MIN_IMPACTS = 8
-"""Smallest number of impacts that a window should have, in all replicas together."""
-
-WINDOW_EXPONENT = 0.3
-"""Damping exponent of the window-length controller.
-
-The length changes by ``(wanted / executed impacts)^0.3``, as the number of impacts scatters.
-"""
-
-MIN_CHANGE, MAX_CHANGE = 0.5, 1.5
-"""Least and largest ratio of the lengths of two successive windows by that controller."""
 
 SPEED_MARGIN = 1.15
 """Bound on the speeds within a window, over the speed of the fastest sphere before it."""
@@ -90,9 +72,6 @@ MIN_SKIN = 0.2
 ALLOWED_OVERLAP = 1e-9
 """Overlap in diameters that is allowed in a given start."""
 
-DRIVE_STREAM = 3
-"""Stream of the random numbers of a drive, beside those of the start."""
-
 
 class HardState(NamedTuple):
     """Internal state of hard spheres, see `SphereState`.
@@ -114,22 +93,13 @@ class HardState(NamedTuple):
     key: UInt32[Array, "3"] | None = None
 
 
-class WindowSums(NamedTuple):
-    """Sums of the fields of `WindowProgress` with the same names over the slots of each replica."""
-
-    dissipated: Float[Array, "replicas"]
-    rotational_gain: Float[Array, "replicas"] | None
-    num_impacts: Int[Array, "replicas"]
-    regularised: Int[Array, "replicas"]
-
-
 class HardDynamics(AbstractSphereDynamics):
     """Hard spheres in windows of time.
 
     Attributes:
         scene, shape, capacity, equilibration_capacity, listed_by_skin, engine, compiled_engine: see
             `AbstractSphereDynamics`.
-        share: impacts per particle in a window.
+        share: wanted impacts of a sphere in a window.
         contact_time: in mean free times; the impact of a sphere within this time of its last one is
             elastic.
         all_elastic: whether all impacts are elastic and smooth.
@@ -146,8 +116,13 @@ class HardDynamics(AbstractSphereDynamics):
     contact_time: Float[Array, ""]
     all_elastic: Bool[Array, ""]
 
+    @property
+    def window_lengths(self) -> WindowController:
+        """The controller of the lengths of windows."""
+        return WindowController(self.share, self.replicas * self.shape[1])
+
     def elastic(self) -> "HardDynamics":
-        """Return the dynamics of smooth elastic spheres, between such walls, without drag.
+        """Return the dynamics of smooth elastic spheres and walls, without drag or a drive.
 
         Zero drag and a zero law keep the structure of a run of smooth spheres, whose compiled
         program is reused.
@@ -156,47 +131,43 @@ class HardDynamics(AbstractSphereDynamics):
         walls = material.walls
         if walls is not None:
             walls = walls._replace(surface=None)
-        law, drag = jax.tree.map(lambda x: 0 * x, (material.law, material.drag))
-        material = material._replace(law=law, surface=None, walls=walls, drag=drag, drive=None)
+        material = material._replace(
+            law=jax.tree.map(lambda x: 0 * x, material.law),
+            surface=None,
+            walls=walls,
+            drag=jax.tree.map(lambda x: 0 * x, material.drag),
+            drive=None,
+        )
         scene = self.scene._replace(material=material)
         return dataclasses.replace(self, scene=scene, all_elastic=jnp.ones((), bool))
 
     def initial_internal(self, velocity: Float[Array, "n d"], key: PRNGKeyArray) -> HardState:
         dtype = velocity.dtype
         material = self.scene.material
-        rate = self.scene.collision_frequency
-        if self.region is not None:
-            rate = rate + 2 / jnp.min(self.region)
+        frequency = self.scene.collision_frequency
+        if self.region is not None:  # impacts on walls
+            frequency = frequency + 2 / jnp.min(self.region)
         spin = None
-        gain = None
-        counted_key = None
+        rotational_gain = None
+        kick_key = None
         if material.surface is not None:
             mean_square = (material.surface.ratio / material.surface.inertia).astype(dtype)
             spin = initial_spins(key, self.shape, mean_square)
-            gain = jnp.zeros(self.replicas, dtype)
+            rotational_gain = jnp.zeros(self.replicas, dtype)
         if material.drive is not None:
-            words = jax.random.bits(jax.random.fold_in(key, DRIVE_STREAM), (2,), jnp.uint32)
-            counted_key = jnp.concatenate([words, jnp.zeros(1, jnp.uint32)])
+            kick_key = initial_kick_key(key)
         return HardState(
             age=jnp.full(len(velocity), jnp.inf, dtype),
             regularised=jnp.zeros(self.replicas, jnp.result_type(int)),
-            window=jnp.asarray(FIRST_WINDOW * self.share / rate, dtype),
+            window=jnp.asarray(self.window_lengths.first(frequency), dtype),
             spin=spin,
-            rotational_gain=gain,
-            key=counted_key,
+            rotational_gain=rotational_gain,
+            key=kick_key,
         )
 
     def initial_tangents(self, state: SphereState, directions: ReducedScene) -> ExchangeTangents:
         material = self.scene.material
         return ExchangeTangents.initial(directions, material, state.velocity, self.replicas)
-
-    def true_velocities(self, state: SphereState) -> tuple[Array, Array | None]:
-        decay = drag_decay(self.scene.drag_rates, state.time + state.time_rest)
-        spin = state.internal.spin
-        return state.velocity * decay.velocity, None if spin is None else spin * decay.spin
-
-    def observe(self, state: SphereState) -> Records:
-        return hard_records(state, self.scene, self.replicas)
 
     @jax.jit
     def prepare(self, state: SphereState, end: ArrayLike) -> tuple[SphereState, Array, Array]:
@@ -225,8 +196,11 @@ class HardDynamics(AbstractSphereDynamics):
             state.fresh, lambda: self._overlaps(state, pairs), lambda: jnp.zeros((), bool)
         )
         fault = state.status | status.flag(status.OVERLAPPING, overlapping)
-        bound_factor = jnp.ones((), state.position.dtype)
-        first = Segment(state._replace(status=fault), jnp.zeros((), bool), bound_factor)
+        first = Segment(
+            state=state._replace(status=fault),
+            stale=jnp.zeros((), bool),
+            retry=jnp.ones((), state.position.dtype),
+        )
         window = partial(self._run_window, listed=listed, pairs=pairs, end=end)
         return repeat_until(end, window, first)
 
@@ -250,27 +224,112 @@ class HardDynamics(AbstractSphereDynamics):
         old = now.state
         bound_factor = now.retry
         scene = self.scene
-        duration, is_last = next_block(old, self._longest_window(old), end)
-        kicked = self._apply_drive(old, duration, 0.0)
+        window = old.internal.window
+        longest = jnp.minimum(window, window_of_small_kicks(old, scene))
+        duration, is_last = next_block(old, longest, end)
+        kicked = kick_at_start(old, scene, duration)
         bound = SPEED_MARGIN * bound_factor * fastest(kicked.velocity, self.replicas)
-        candidates = self._select_candidates(kicked, pairs, duration, bound)
+        candidates = select_candidates(
+            kicked, scene.container, pairs, self.capacity, duration, bound
+        )
         progress = execute_impacts(
             kicked, listed, candidates, scene, duration, self.contact_time, self.all_elastic
         )
-        new = self._state_after_window(kicked, candidates, progress, duration)
-        new = self._apply_drive(new, duration, 1.0)
+        new = self._after_impacts(kicked, candidates, progress, duration)
+        new = kick_at_end(new, scene, duration)
         new = advance_to_end(new, duration, end, is_last)
+        next_window = self.window_lengths.after(window, duration, progress.total_impacts)
+        new = new._replace(internal=new.internal._replace(window=next_window))
 
         fault, repeat = self._judge(new, listed, candidates, progress, bound)
         accepted = (fault == status.OK) & ~repeat
         state = jax.tree.map(partial(jnp.where, accepted), new, old)
-        next_duration = jnp.minimum(state.internal.window, time_left(state, end))
-        next_position = state.position + state.velocity * next_duration
-        next_distance2 = jnp.max(jnp.sum((next_position - listed) ** 2, -1))
+        needed = jnp.maximum(old.needed, candidates.needed)
         return Segment(
-            state=state._replace(status=fault, needed=jnp.maximum(old.needed, candidates.needed)),
-            stale=accepted & (next_distance2 > (0.5 * old.skin) ** 2),
+            state=state._replace(status=fault, needed=needed),
+            stale=accepted & self._will_leave_skin(state, listed, end),
             retry=jnp.where(repeat, BOUND_GROWTH * bound_factor, 1.0),
+        )
+
+    def _after_impacts(
+        self,
+        state: SphereState,
+        candidates: ImpactCandidates,
+        progress: WindowProgress,
+        duration: Array,
+    ) -> SphereState:
+        """Return the state after the impacts of a window, with the time at its start.
+
+        Args:
+            state: at the start of the window, after the first half of the kicks.
+            candidates: pairs and particles of the window.
+            progress: after the last impact.
+            duration: of the window.
+        """
+
+        def with_members(values: Array, of_members: Any) -> Array:
+            return values.at[candidates.members].set(of_members, mode="drop")
+
+        paths = progress.paths
+        sums = progress.sums(candidates, self.replicas)
+        flown = state.position + state.velocity * duration
+        internal = state.internal
+        more_regularised = sums.regularised.astype(internal.regularised.dtype)
+        spin = None
+        rotational_gain = None
+        tangents = None
+        if internal.spin is not None:
+            spin = with_members(internal.spin, paths.spin)
+            rotational_gain = internal.rotational_gain + sums.rotational_gain
+        if state.tangents is not None:
+            tangents = self._tangents_after(state, sums, duration)
+        return state._replace(
+            position=with_members(flown, paths.x + paths.v * duration),
+            velocity=with_members(state.velocity, paths.v),
+            dissipated=state.dissipated + sums.dissipated,
+            collisions=state.collisions + sums.collisions.astype(state.collisions.dtype),
+            internal=internal._replace(
+                age=with_members(internal.age + duration, duration - paths.last),
+                regularised=internal.regularised + more_regularised,
+                spin=spin,
+                rotational_gain=rotational_gain,
+            ),
+            tangents=tangents,
+        )
+
+    def _tangents_after(
+        self, state: SphereState, sums: WindowSums, duration: Array
+    ) -> ExchangeTangents:
+        """Return the tangents after a window, with the heat of its kicks.
+
+        Args:
+            state: at the start of the window, after the first half of the kicks.
+            sums: over the impacts of the window.
+            duration: of the window.
+        """
+        tangents = state.tangents
+        material = self.scene.material
+        before = [kinetic_energy(state.velocity, self.replicas)]
+        gained = [-sums.dissipated]
+        if sums.rotational_gain is not None:
+            spin_energy = kinetic_energy(state.internal.spin, self.replicas)
+            before.append(material.surface.inertia * spin_energy)
+            gained.append(sums.rotational_gain)
+        num_energies = len(gained)
+        by_direction = sums.gains[:-num_energies]
+        by_scale = sums.gains[-num_energies:]
+        if material.drive is not None:
+            heat, slopes = heat_of_kicks(state, self.scene, duration, tangents.directions)
+            gained[0] = gained[0] + heat
+            by_direction = by_direction.at[:, 0].add(slopes[:, None])
+            # Heating does not depend on the speeds, unlike the frequency of impacts.
+            by_scale = by_scale.at[0, 0].add(-heat)
+        return tangents.after(
+            jnp.stack(before),
+            jnp.stack(gained),
+            by_direction,
+            by_scale,
+            sums.collisions.astype(sums.gains.dtype),
         )
 
     def _judge(
@@ -281,115 +340,29 @@ class HardDynamics(AbstractSphereDynamics):
         progress: WindowProgress,
         bound: Float[Array, "replicas"],
     ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
-        """Return the faults of a window, and whether it is repeated with a larger bound on speeds.
-
-        A window that lacks pairs or is not finite has that fault alone; one that is repeated, none.
-        """
+        """Return the faults of a window, and whether to repeat it with a larger bound on speeds."""
         distance2 = jnp.max(jnp.sum((new.position - listed) ** 2, -1))
-        exceeded = jnp.maximum(distance2, jnp.max(progress.max_distance2)) > (0.5 * new.skin) ** 2
+        distance2 = jnp.maximum(distance2, jnp.max(progress.max_distance2))
+        left_skin = distance2 > (0.5 * new.skin) ** 2
         member_bound = bound[jnp.minimum(candidates.replica, self.replicas - 1)]
         too_fast = jnp.any(progress.max_speed2 > member_bound**2)
         invalid = self.invalid_block(new, candidates.needed)
-        other = status.flag(status.SKIN_EXCEEDED, exceeded)
-        other |= status.flag(status.STALLED, progress.num_rounds >= MAX_ROUNDS)
-        fault = jnp.where(invalid > 0, invalid, jnp.where(too_fast, status.OK, other))
-        return fault.astype(jnp.int32), too_fast & (invalid == 0)
+        repeat = too_fast & (invalid == 0)
+        fault = status.flag(status.SKIN_EXCEEDED, left_skin)
+        fault |= status.flag(status.STALLED, progress.num_rounds >= MAX_ROUNDS)
+        # A window to be repeated has no fault; one that lacks pairs or is not finite, that alone.
+        fault = jnp.where(repeat, status.OK, fault)
+        fault = jnp.where(invalid > 0, invalid, fault)
+        return fault.astype(jnp.int32), repeat
 
-    def _select_candidates(
-        self, state: SphereState, pairs: Pairs, duration: Array, bound: Float[Array, "replicas"]
-    ) -> ImpactCandidates:
-        """Select the pairs that touch in free flight, and all that may touch once paths have
-        changed. Particles that reach a wall are members, too.
-
-        Args:
-            state: at the beginning of the window.
-            pairs: a neighbour list, with all pairs that may touch.
-            duration: of the window.
-            bound: an upper bound on the speeds in each replica during the window.
-        """
-        x = state.position
-        v = state.velocity
-        container = self.scene.container
-        n = len(x)
-        size = self.shape[1]
-        # The listed pairs that can touch at the largest speeds are a small part of the list.
-        displacement = x[pairs.i] - x[pairs.j] - pairs.offset
-        gap = jnp.sqrt(jnp.sum(displacement * displacement, -1)) - 1
-        gap = jnp.where(pairs.in_use, gap, jnp.inf)
-        is_near = gap < 2 * bound[pairs.i // size] * duration
-        near, real, num_near = rows_where(is_near, self.capacity.near)
-        i = pairs.i[near]
-        j = pairs.j[near]
-        offset = pairs.offset[near]
-        rows = PairRows(i, j, offset, bound[i // size], real)
-
-        free = first_impacts(Paths(x, v, jnp.zeros(n, x.dtype)), rows, duration, container)
-        disturbed = jnp.minimum(jnp.minimum(free.final[i], free.final[j]), duration)
-        closer = free.motion.gap(disturbed) < 2 * rows.bound * (duration - disturbed)
-        selected = rows.real & (jnp.isfinite(free.times) | closer)
-        at_walls = jnp.zeros(n, bool) if free.walls is None else jnp.isfinite(free.walls.times)
-        max_rows = self.capacity.contacts
-        max_members = self.capacity.members
-        found = select_members(selected, i, j, at_walls, max_rows=max_rows, max_members=max_members)
-        rows = PairRows(
-            found.first, found.second, offset[found.rows], rows.bound[found.rows], found.real
-        )
-        needed = jnp.stack(
-            [pairs.count, pairs.lookahead, num_near, found.num_rows, found.num_members]
-        )
-        return ImpactCandidates(found.members, rows, found.members // size, needed)
-
-    def _state_after_window(
-        self,
-        state: SphereState,
-        candidates: ImpactCandidates,
-        progress: WindowProgress,
-        duration: Array,
-    ) -> SphereState:
-        """Return the state after a window at its old time, with the length of the next window."""
-
-        def to_members(values, new):
-            return values.at[candidates.members].set(new, mode="drop")
-
-        sums = _window_sums(candidates, progress, self.replicas)
-        impacts = sums.num_impacts // 2
-        lost = sums.dissipated
-        wanted = max(0.5 * self.share * len(state.position), MIN_IMPACTS)
-        num_in_window = jnp.sum(impacts).astype(lost.dtype)
-        if progress.num_wall_impacts is not None:  # each of one sphere, not of two
-            num_on_walls = jnp.sum(progress.num_wall_impacts).astype(lost.dtype)
-            num_in_window = num_in_window + num_on_walls / 2
-        ratio = (wanted / jnp.maximum(num_in_window, 1)) ** WINDOW_EXPONENT
-        ratio = jnp.clip(ratio, MIN_CHANGE, MAX_CHANGE)
-        paths = progress.paths
-        internal = state.internal
-        more = sums.regularised.astype(internal.regularised.dtype) // 2
-        regularised = internal.regularised + more
-        rotational_gain = None
-        if sums.rotational_gain is not None:
-            rotational_gain = internal.rotational_gain + sums.rotational_gain
-        # The last, short window before an end says nothing about the rate of impacts.
-        full_length = duration > 0.5 * internal.window
-        new = state._replace(
-            position=to_members(
-                state.position + state.velocity * duration, paths.x + paths.v * duration
-            ),
-            velocity=to_members(state.velocity, paths.v),
-            dissipated=state.dissipated + lost,
-            collisions=state.collisions + impacts.astype(state.collisions.dtype),
-            internal=internal._replace(
-                age=to_members(internal.age + duration, duration - paths.last),
-                regularised=regularised,
-                window=jnp.where(full_length, duration * ratio, internal.window),
-                spin=None if internal.spin is None else to_members(internal.spin, paths.spin),
-                rotational_gain=rotational_gain,
-            ),
-        )
-        if state.tangents is None:
-            return new
-        return new._replace(
-            tangents=self._tangents_after(state, candidates, progress.gains, sums, duration)
-        )
+    def _will_leave_skin(
+        self, state: SphereState, listed: Float[Array, "n d"], end: ArrayLike
+    ) -> Bool[Array, ""]:
+        """Return whether free flight in the next window makes the neighbour list stale."""
+        duration = jnp.minimum(state.internal.window, time_left(state, end))
+        position = state.position + state.velocity * duration
+        distance2 = jnp.max(jnp.sum((position - listed) ** 2, -1))
+        return distance2 > (0.5 * state.skin) ** 2
 
     def recover(self, now: Segment, before: SphereState) -> SphereState:
         """Shorten the window if the skin was exceeded at once, and the skin of a crowded list."""
@@ -407,175 +380,20 @@ class HardDynamics(AbstractSphereDynamics):
             status=state.status & FATAL,
         )
 
-    def _apply_drive(self, state: SphereState, duration: ArrayLike, place: float) -> SphereState:
-        """Return the state with half of the kicks of a window, at its begin (place 0) or end (1).
+    def true_velocities(self, state: SphereState) -> tuple[Array, Array | None]:
+        decay = drag_decay(self.scene.drag_rates, state.time + state.time_rest)
+        spin = state.internal.spin
+        if spin is not None:
+            spin = spin * decay.spin
+        return state.velocity * decay.velocity, spin
 
-        Time and window are those before the window; the velocities may already have had kicks.
-        """
-        counted_key = state.internal.key
-        replicas = self.replicas
-        if counted_key is None:
-            return state
-        variance = drive_variance(self.scene, state.time + state.time_rest, duration, place)
-        key = jax.random.fold_in(threefry_key(counted_key[:2]), counted_key[2])
-        velocity = by_replica(state.velocity, replicas)
-        kicks = jax.vmap(random_kicks, (0, 0, None))(
-            jax.random.split(key, replicas), velocity, self.scene.container is None
-        )
-        velocity = (velocity + jnp.sqrt(variance) * kicks).reshape(state.velocity.shape)
-        internal = state.internal._replace(key=counted_key.at[2].add(jnp.uint32(1)))
-        return state._replace(velocity=velocity, internal=internal)
-
-    def _longest_window(self, state: SphereState) -> Float[Array, ""]:
-        """Return a length with which the kicks of a window are small beside the velocities."""
-        if self.scene.material.drive is None:
-            return state.internal.window
-        lowest = jnp.min(temperature(state.velocity, self.replicas))
-        time = state.time
-        growth = 2 * drive_variance(self.scene, time + state.time_rest, jnp.ones_like(lowest), 0.0)
-        safe_growth = jnp.where(growth > 0, growth, 1.0)
-        longest = jnp.where(growth > 0, MAX_KICK * lowest / safe_growth, jnp.inf)
-        return jnp.minimum(state.internal.window, longest)
-
-    def _tangents_after(
-        self,
-        kicked: SphereState,
-        candidates: ImpactCandidates,
-        gains: Float[Array, "changes energies rows"],
-        sums: WindowSums,
-        duration: Array,
-    ) -> ExchangeTangents:
-        """Return the tangents after a window.
-
-        Args:
-            kicked: state after the first half of the kicks.
-            candidates: pairs and particles of the window.
-            gains: of the energy in their impacts, `WindowProgress.gains`.
-            sums: over the impacts of the window.
-            duration: of the window.
-        """
-        tangents = kicked.tangents
-        scene = self.scene
-        replicas = self.replicas
-        material = scene.material
-        replica = candidates.replica
-        of_gains = replica[candidates.rows.a]
-        if scene.container is not None:
-            of_gains = jnp.concatenate([of_gains, replica])
-        by_change = jnp.zeros((*gains.shape[:-1], replicas), gains.dtype)
-        by_change = by_change.at[..., of_gains].add(gains, mode="drop")
-        before = [kinetic_energy(kicked.velocity, replicas)]
-        gained = [-sums.dissipated]
-        if sums.rotational_gain is not None:
-            before.append(material.surface.inertia * kinetic_energy(kicked.internal.spin, replicas))
-            gained.append(sums.rotational_gain)
-        num_energies = len(gained)
-        by_direction = by_change[:-num_energies]
-        by_scale = by_change[-num_energies:]
-        if material.drive is not None:
-
-            def heating(material: ReducedScene) -> Array:
-                changed = scene._replace(material=material)
-                start = kicked.time + kicked.time_rest
-                first, second = (drive_variance(changed, start, duration, k) for k in (0.0, 1.0))
-                return kicked.velocity.size / replicas / 2 * (first + second)
-
-            heat, linear = jax.linearize(heating, material)
-            by_direction = by_direction.at[:, 0].add(jax.vmap(linear)(tangents.directions)[:, None])
-            # Heating does not depend on the speeds, unlike the frequency of impacts.
-            by_scale = by_scale.at[0, 0].add(-heat)
-            gained[0] = gained[0] + heat
-        return tangents.after(
-            jnp.stack(before), jnp.stack(gained), by_direction, by_scale, sums.num_impacts / 2
-        )
+    def observe(self, state: SphereState) -> Records:
+        return hard_records(state, self.scene, self.replicas)
 
 
-def allowed_overlap(dtype: Any, side: Any) -> Any:
+def allowed_overlap(dtype: DTypeLike, side: ArrayLike) -> Array:
     """Return the overlap up to which spheres of a start count as hard.
 
     It is at least the overlap of spheres in contact by rounding of positions.
     """
     return jnp.maximum(ALLOWED_OVERLAP, 10 * side * jnp.finfo(dtype).eps)
-
-
-def drive_variance(
-    scene: SphereScene, start: Float[Array, ""], duration: ArrayLike, place: float
-) -> Float[Array, ""]:
-    """Return the variance of half of the kicks of a window, at its begin (place 0) or end (1)."""
-    strength = scene.material.drive * scene.collision_frequency
-    return kick_growth(strength, scene.drag_rates, start, jnp.asarray(duration), place)
-
-
-def _window_sums(
-    candidates: ImpactCandidates, progress: WindowProgress, replicas: int
-) -> WindowSums:
-    """Return the sums over the slots of each replica; an empty slot belongs to none."""
-
-    def total(values: Array) -> Array:
-        sums = jnp.zeros(replicas, values.dtype)
-        return sums.at[candidates.replica].add(values, mode="drop")
-
-    gain = progress.rotational_gain
-    return WindowSums(
-        dissipated=total(progress.dissipated),
-        rotational_gain=None if gain is None else total(gain),
-        num_impacts=total(progress.num_impacts),
-        regularised=total(progress.regularised),
-    )
-
-
-@partial(jax.jit, static_argnames="replicas")
-def hard_records(state: SphereState, scene: SphereScene, replicas: int) -> Records:
-    """Return the records of a state.
-
-    In a scene with elements the dissipated energy includes all losses in impacts and to drag.
-    """
-    values, velocity = common_values(state, scene, replicas)
-    material = scene.material
-    tangents = state.tangents
-    (n, d) = velocity.shape[1:]
-    regularised = state.internal.regularised.astype(jnp.result_type(float))
-    values["regularised"] = 2 / n * regularised
-    if material.has_elements:
-        values |= _values_with_elements(state, scene, values)
-    if tangents is None:
-        return Records(values, {}, {})
-    drag_directions = jax.tree.map(
-        lambda x: x * scene.collision_frequency, tangents.directions.drag
-    )
-    time = state.time + state.time_rest
-    rates, slopes = exchange_slopes(values, tangents, scene.drag_rates, drag_directions, time, n, d)
-    if not material.has_elements:
-        rates, slopes = (with_dissipated_energy(x, d) for x in (rates, slopes))
-    return Records(values, rates, slopes)
-
-
-def _values_with_elements(
-    state: SphereState, scene: SphereScene, values: dict[str, Array]
-) -> dict[str, Array]:
-    """Return the records of rotation, and the records that drag changes."""
-    replicas = len(values["temperature"])
-    n = len(state.velocity) // replicas
-    d = state.velocity.shape[1]
-    decay = drag_decay(scene.drag_rates, state.time + state.time_rest)
-    velocity_factor = decay.velocity
-    spin_factor = decay.spin
-    first = kinetic_energy(state.first_velocity, replicas) / n
-    lost = first - velocity_factor**2 * (first - state.dissipated / n)
-    changed = {
-        "temperature": values["temperature"] * velocity_factor**2,
-        "velocity_correlation": values["velocity_correlation"] * velocity_factor,
-    }
-    if state.internal.spin is not None:  # None in equilibration
-        surface = scene.material.surface
-        square = jnp.mean(state.internal.spin.reshape(replicas, -1) ** 2, axis=1)
-        changed["rotational_temperature"] = surface.inertia * square * spin_factor**2
-        rotational = NUM_SPIN_COMPONENTS[d] / 2 * surface.ratio
-        kept = spin_factor**2 * (rotational + state.internal.rotational_gain / n)
-        lost = lost + rotational - kept
-    if scene.material.drive is not None:
-        # Drag takes an unknown part of the heat of the drive.
-        dragged = (velocity_factor < 1) | (spin_factor < 1)
-        driven = scene.material.drive > 0
-        lost = jnp.where(dragged & driven, jnp.nan, lost)
-    return changed | {"dissipated_energy": lost}

@@ -189,20 +189,3 @@ def _final_until(
 
     final, _ = jax.lax.while_loop(unfinished, lower, (first, jnp.array(True)))
     return final
-
-
-class ImpactCandidates(NamedTuple):
-    """Pairs that may touch in a window, and the particles that belong to them, its members.
-
-    Attributes:
-        members: the particle in each slot, in increasing order; n where a slot is empty.
-        rows: the pairs.
-        replica: of each member.
-        needed: number of rows that each array of the run would need, in the order of its
-            capacities; where one exceeds the capacity, pairs or particles are missing.
-    """
-
-    members: Int[Array, "members"]
-    rows: PairRows
-    replica: Int[Array, "members"]
-    needed: Int[Array, "kinds"]

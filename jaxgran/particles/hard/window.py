@@ -2,7 +2,7 @@
 
 The arrays of a window have a row for each pair that may touch, and a slot for each sphere that may
 be hit in the window, on another sphere or on a wall. A slot holds one sphere; further slots at the
-end of the arrays are empty (`jaxgran.particles.hard.prediction.ImpactCandidates`). Units as in
+end of the arrays are empty (`jaxgran.particles.hard.candidates.ImpactCandidates`). Units as in
 `jaxgran.particles.hard.impacts`.
 """
 
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxgran.gradients.tangents import ExchangeTangents
+from jaxgran.particles.hard.candidates import ImpactCandidates
 from jaxgran.particles.hard.impacts import (
     ImpactEffect,
     ImpactEvents,
@@ -23,7 +24,6 @@ from jaxgran.particles.hard.impacts import (
 )
 from jaxgran.particles.hard.prediction import (
     FirstImpacts,
-    ImpactCandidates,
     PairRows,
     Paths,
     WallImpacts,
@@ -105,6 +105,24 @@ class SlotImpacts(NamedTuple):
     effect: ImpactEffect
 
 
+class WindowSums(NamedTuple):
+    """Sums over the impacts of a window in each replica.
+
+    Attributes:
+        dissipated: translational energy lost.
+        rotational_gain: gain of the energy of the (transformed) spins; None for smooth spheres.
+        collisions: number of impacts of two spheres.
+        regularised: number of impacts that were elastic because they followed too soon.
+        gains: tangents of the energy gained, see `exchange_gains`; without tangents, no changes.
+    """
+
+    dissipated: Float[Array, "replicas"]
+    rotational_gain: Float[Array, "replicas"] | None
+    collisions: Int[Array, "replicas"]
+    regularised: Int[Array, "replicas"]
+    gains: Float[Array, "changes energies replicas"]
+
+
 class WindowProgress(NamedTuple):
     """Particles after the impacts of a window, and sums over these impacts.
 
@@ -137,6 +155,36 @@ class WindowProgress(NamedTuple):
     num_rounds: Int[Array, ""]
     gains: Float[Array, "changes energies rows"]
 
+    @property
+    def total_impacts(self) -> Int[Array, ""]:
+        """Number of impacts of all spheres; an impact of two spheres counts for both of them."""
+        total = jnp.sum(self.num_impacts)
+        if self.num_wall_impacts is None:
+            return total
+        return total + jnp.sum(self.num_wall_impacts)
+
+    def sums(self, candidates: ImpactCandidates, replicas: int) -> WindowSums:
+        """Return the sums over the impacts in each replica; an empty slot belongs to none."""
+        replica = candidates.replica
+        replica_of_gain = replica[candidates.rows.a]
+        if self.num_wall_impacts is not None:
+            replica_of_gain = jnp.concatenate([replica_of_gain, replica])
+
+        def total(values: Array, replica: Int[Array, "rows"]) -> Array:
+            zeros = jnp.zeros((*values.shape[:-1], replicas), values.dtype)
+            return zeros.at[..., replica].add(values, mode="drop")
+
+        rotational_gain = None
+        if self.rotational_gain is not None:
+            rotational_gain = total(self.rotational_gain, replica)
+        return WindowSums(
+            dissipated=total(self.dissipated, replica),
+            rotational_gain=rotational_gain,
+            collisions=total(self.num_impacts, replica) // 2,
+            regularised=total(self.regularised, replica) // 2,
+            gains=total(self.gains, replica_of_gain),
+        )
+
 
 class ImpactWindow(NamedTuple):
     """A window of time, and what decides the impacts in it.
@@ -168,11 +216,12 @@ class ImpactWindow(NamedTuple):
         has_walls = self.scene.container is not None
         counts = jnp.zeros(num_slots, jnp.int32)
         zeros = jnp.zeros(num_slots, paths.x.dtype)
-        shape = (0, 1, num_rows)
+        num_changes = 0
+        num_energies = 1
         if self.tangents is not None:
             num_directions, num_energies, _ = self.tangents.energies.shape
-            num_wall_rows = num_slots if has_walls else 0
-            shape = (num_directions + num_energies, num_energies, num_rows + num_wall_rows)
+            num_changes = num_directions + num_energies
+        num_gains = num_rows + num_slots if has_walls else num_rows
         return WindowProgress(
             paths=paths,
             dissipated=zeros,
@@ -184,7 +233,7 @@ class ImpactWindow(NamedTuple):
             max_speed2=zeros,
             executed=jnp.array(True),
             num_rounds=jnp.int32(0),
-            gains=jnp.zeros(shape, zeros.dtype),
+            gains=jnp.zeros((num_changes, num_energies, num_gains), zeros.dtype),
         )
 
     def execute_round(self, progress: WindowProgress) -> WindowProgress:
