@@ -260,7 +260,7 @@ def _needed_doublings(drift: Array) -> Array:
 
 
 def _with_more_variables(x: Float[Array, "n n nodes gases"], count: int) -> Array:
-    """Return matrices with more rows and columns of 0, shape (nodes, n + count, n + count, gases)."""
+    """Return matrices with `count` more rows and columns of 0, the axis of nodes first."""
     padded = jnp.pad(x, [(0, count), (0, count), (0, 0), (0, 0)])
     return jnp.moveaxis(padded, 2, 0)
 

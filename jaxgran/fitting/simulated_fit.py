@@ -27,7 +27,6 @@ from jaxgran.fitting.search import Minimum
 from jaxgran.fitting.setup import (
     Request,
     build_problem,
-    problem_with_rate_errors,
     with_values_of,
 )
 from jaxgran.fitting.simulated_errors import (
@@ -240,14 +239,19 @@ def _explanations(
     flat = search.average.flat
     start = first.copy()
     start[: flat.size] = flat
-    noisy = search.average.comparison.curve.rows
-    rows = replace(problem.curves[0], grains=noisy.grains, simulation=noisy.simulation)
+    # Errors are those of the particles, on whose curve the shift places theory.
+    of_particles = search.average.comparison.curve.rows
+    rows = replace(
+        problem.curves[0],
+        grains=of_particles.grains,
+        simulation=of_particles.simulation,
+        rate_error=of_particles.rate_error,
+    )
     values = problem.values(start)[""]
     predicted = predicted_curve(rows, problem.model.simplified_for(rows.scene), values, [])
     compared = predicted.prediction.compared[predicted.place]
     offset = np.where(rows.used > 0, model_values.reshape(2, -1).T - compared, 0.0)
-    moved = replace(rows, offset=offset)
-    problem = problem_with_rate_errors(replace(problem, measurements=(moved,)), start)
+    problem = replace(problem, measurements=(replace(rows, offset=offset),))
     errors = np.sqrt(np.diag(noise))
     minimum = Minimum(start, value=0.0, steps=0, converged=True)
     return compare_alternatives(problem, [minimum], errors)

@@ -32,7 +32,7 @@ CONTACT_MEMORY = 0.30
 """Time over which the scatter is forgotten, in t_c: ``<f>^2/(2 <f^2>)`` with <f> = 4/9."""
 
 ENERGETIC_SPEED = 2.4
-"""Normal speed, over sqrt(2 T), of the contacts that hold most of it: E^2 is 2.9 m T in the mean."""
+"""Normal speed, over sqrt(2 T), of the contacts that hold most: their E is 2.9 m T in the mean."""
 
 
 class ContactNoise(NamedTuple):
