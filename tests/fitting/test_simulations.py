@@ -12,7 +12,7 @@ import pytest
 import jaxgran
 from jaxgran.fitting import simulated_fit
 from tests.beads import glass_beads, soft_beads
-from tests.fitting.curves import BOTH, A, deviation, rough_beads, synthetic
+from tests.fitting.curves import BOTH, A, deviation, in_range, rough_beads, synthetic
 from tests.fitting.curves import fitted as fit_measured
 
 
@@ -29,6 +29,25 @@ def test_T_rot_is_fitted_beside_T():
     # Both are known to some per cent; from T alone they are not distinguishable.
     assert float(result.standard_error[0] / result.estimate[0]) < 0.1
     assert float(result.standard_error[1]) < 0.06
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
+def test_a_good_fit_through_particles_is_consistent(seed):
+    # Simulations of fewer grains than were measured, whose noise is most of the differences.
+    gas = glass_beads(0.15)
+    times = np.geomspace(1.0, 60.0, 40) * float(gas.mean_free_time)
+    measured = jaxgran.DSMC(1000, replicas=4)
+    curve = jaxgran.cool(gas, times, model=measured, key=jax.random.key(seed), progress=False)
+    curve = jaxgran.CoolingCurve(curve.times, curve.temperature)
+    measurement = jaxgran.Measurement(gas, curve, num_particles=1000, replicas=4)
+    model = jaxgran.DSMC(250, replicas=2)
+    key = jax.random.key(10 + seed)
+    result = jaxgran.fit(measurement, free=(A,), model=model, key=key, progress=False)
+    assert result.converged and result.p_value > 0.01 and result.smooth_p_value > 0.01
+    assert result.grade != "not consistent"
+    assert not any(alternative.preferred for alternative in result.alternatives)
+    assert in_range(result, gas.value(A))
 
 
 @pytest.mark.minutes
