@@ -22,6 +22,8 @@ import, are (`support/version.py`)
     reference: the first call of `jax.jit(jax.jacfwd(...))` of ln T of kinetic theory in A and T_0.
     fit: fit with its range of a curve with 61 points, then of one with 47, then with other `free`.
     lengths: fits with their ranges of 20 curves of 20 lengths.
+    plan: a fit of 250 grains with errors of 2 %, a plan about it, and 100 imitations of it and of
+        its strongest alternative.
     command: `jaxgran fit` as a process, with an empty cache, again, and without a cache.
     SoftSpheres, HardSpheres, DSMC: runs of one mean free time; the last one of the first two
         continues from the particles of the one before.

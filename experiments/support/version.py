@@ -115,6 +115,18 @@ def fit(gas: Any, curve: Any, _: int) -> None:
     step("other free", lambda: fit_of(gas, some, free=BOTH[:1]))
 
 
+def plan(gas: Any, curve: Any, _: int) -> None:
+    """Fit a curve of 250 grains with errors of 2 %, plan an experiment like it, and imitate it."""
+    some = of_points(curve, 30)
+    some = replace(some, temperature_error=0.02 * some.temperature)
+    measurement = jaxgran.Measurement(gas, some, num_particles=250, errors_measured=True)
+    result = step("planned fit", partial(jaxgran.fit, measurement))
+    step("planned fit again", partial(jaxgran.fit, measurement), repeats=5)
+    step("plan", partial(jaxgran.plan, measurement))
+    step("plan again", partial(jaxgran.plan, measurement))
+    step("200 imitations", partial(jaxgran.imitate, result, runs=100, progress=False))
+
+
 def first_run(name: str, gas: Any, _: Any, num: int) -> None:
     """Run a particle model for one mean free time, and continue where it ended."""
     times = np.array([0.5, 1.0]) * float(gas.mean_free_time)
@@ -240,7 +252,7 @@ if __name__ == "__main__":
     measured, header = jaxgran.read_curve(file)
     read_gas = ANY_VERSION.read_gas if IS_OLD else (lambda _: jaxgran.read_measurement(file).gas)
     measured_gas = read_gas(header)
-    tasks: dict[str, Any] = {"reference": reference, "fit": fit, "lengths": lengths}
+    tasks: dict[str, Any] = {"reference": reference, "fit": fit, "lengths": lengths, "plan": plan}
     tasks |= {"speed": speed, "numbers": numbers}
     tasks |= {name: partial(first_run, name) for name in SPEED}
     constant = 0.0 if task == "numbers" else 3e-6

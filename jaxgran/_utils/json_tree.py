@@ -38,6 +38,8 @@ def to_json(value: Any) -> Any:
     if isinstance(value, float):
         return value if np.isfinite(value) else {"float": repr(value)}
     if isinstance(value, np.ndarray | jax.Array):
+        if getattr(value.dtype, "kind", None) not in {*"biuf"}:  # keys of JAX have none
+            raise NotStorable(f"an array of {value.dtype} cannot be stored as JSON")
         array = np.asarray(value)
         kind = "jax" if isinstance(value, jax.Array) else "numpy"
         numbers = [to_json(x) for x in array.ravel().tolist()]

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxgran.fitting.rows import Noise
 from jaxgran.scene.gas import Gas
@@ -146,12 +146,14 @@ class _Steps(NamedTuple):
         growth: propagators less 1, shape (nodes, n, n, gases).
         increments: what is added to the covariance, shape (nodes, n, n, gases).
         sizes: standard deviations of the passing errors, shape (nodes, n - k - 1, gases).
+        at_start: their variances at t = 0 over those in the long run, shape (n - k - 1,).
     """
 
     start: Any
     growth: Any
     increments: Any
     sizes: Any
+    at_start: Any
 
 
 def _steps(gas: Gas, nodes: Nodes, noise: Noise, differentiable: bool) -> _Steps:
@@ -170,37 +172,49 @@ def _steps(gas: Gas, nodes: Nodes, noise: Noise, differentiable: bool) -> _Steps
         growth=growth.at[:, places, places].set(jnp.expm1(-decays)),
         increments=increments.at[:, places, places].set(-jnp.expm1(-2 * decays)),
         sizes=jnp.stack([error.size for error in errors], axis=1),
+        at_start=np.array([error.at_start for error in errors]),
     )
 
 
 class _PassingError(NamedTuple):
-    """A stationary scatter of the measured ln T, which T forgets exponentially.
+    """A scatter of the measured ln T that is forgotten exponentially.
 
     Attributes:
         decay: of its logarithm since the node before, shape (nodes, gases).
-        size: its standard deviation, of the same shape.
+        size: its standard deviation in the long run, of the same shape.
+        at_start: its variance at t = 0 over that in the long run.
     """
 
     decay: Array
     size: Array
+    at_start: float
 
 
 def _passing_errors(gas: Gas, nodes: Nodes, noise: Noise) -> list[_PassingError]:
     """Return the sampling error, and the scatter by contacts of soft spheres."""
     collisions = _change(nodes.collisions)
     sample = jnp.broadcast_to(jnp.sqrt(noise.sample), collisions.shape)
-    errors = [_PassingError(SAMPLE_MEMORY * collisions, sample)]
+    errors = [_PassingError(SAMPLE_MEMORY * collisions, sample, at_start=1.0)]
     log_T = nodes.log_temperature - nodes.log_temperature[:1]
     contacts = jax.vmap(contact_noise, in_axes=(0, -1), out_axes=-1)(gas, log_T)
     if contacts is not None:
-        size = jnp.sqrt(noise.inverse_number) * contacts.size
-        decay = collisions / contacts.memory
-        if nodes.is_before is not None:
-            # Two times on either side of the start are farther apart than their nodes.
-            is_beside = nodes.is_before | jnp.append(False, nodes.is_before[:-1])
-            decay = jnp.where(is_beside[:, None], jnp.inf, decay)
-        errors.append(_PassingError(decay, size))
+        size = jnp.sqrt(noise.inverse_number * noise.contacts) * contacts.size
+        decay = _without_mirrored(collisions / contacts.memory, nodes.is_before)
+        errors.append(_PassingError(decay, size, at_start=0.0))
     return errors
+
+
+def _without_mirrored(
+    decay: Float[Array, "nodes gases"], is_before: Bool[Array, "nodes"] | None
+) -> Array:
+    """Return a decay that is complete next to nodes whose times are before the start.
+
+    Nodes are ordered by their distance from the start: two on either side of it are farther apart.
+    """
+    if is_before is None:
+        return decay
+    is_next_to_one = is_before | jnp.append(False, is_before[:-1])
+    return jnp.where(is_next_to_one[:, None], jnp.inf, decay)
 
 
 class _Process(NamedTuple):
@@ -293,8 +307,9 @@ def _start(steps: _Steps, noise: Noise, residuals: Array) -> _State:
     of_run = len(steps.start)
     mean = jnp.zeros((size, *residuals.shape[2:]), residuals.dtype)
     # The error of the rate and passing errors are over their standard deviations.
-    unit = jnp.eye(size, dtype=residuals.dtype)[..., None]
-    covariance = jnp.broadcast_to(unit, (size, size, residuals.shape[-1]))
+    variances = np.concatenate([np.ones(of_run + 1), steps.at_start])
+    diagonal = jnp.asarray(np.diag(variances), residuals.dtype)[..., None]
+    covariance = jnp.broadcast_to(diagonal, (size, size, residuals.shape[-1]))
     covariance = covariance.at[:of_run, :of_run].set(steps.start)
     covariance = covariance.at[LOG_T, LOG_T].add(noise.inverse_number * noise.first)
     return _State(mean, covariance)

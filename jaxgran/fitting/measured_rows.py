@@ -76,7 +76,7 @@ def curve_rows(
         values=values,
         errors=errors,
         used=_used(measurement, values, errors, fits_T_0),
-        grains=_grains(measurement, fits_T_0),
+        grains=_grains(measurement, model, fits_T_0),
         faster=_finite_size_factor(measurement),
         unit_time=float(scales_at(gas).mean_free_time),
         rate_error=RateError(np.zeros(1), np.zeros(1)),
@@ -234,14 +234,16 @@ def _used(
     return used
 
 
-def _grains(measurement: Measurement, fits_T_0: bool) -> Grains:
+def _grains(measurement: Measurement, model: AbstractModel, fits_T_0: bool) -> Grains:
     N = measurement.num_particles
     is_ensemble = measurement.ensemble_start and not fits_T_0
+    is_hard = isinstance(model, KineticTheory) and "softness" not in model.corrections
     return Grains(
         inverse_number=1 / ((UNKNOWN_NUMBER if N is None else N) * measurement.replicas),
         log_error=WEAK_SCATTER if N is None else SCATTER_ERROR,
         sample=sampling_variance(measurement, measurement.gas.dimension),
         first=2 / measurement.gas.dimension if is_ensemble else 0.0,
+        contacts=0.0 if is_hard else 1.0,
     )
 
 

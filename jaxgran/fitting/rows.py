@@ -86,12 +86,14 @@ class Grains(NamedTuple):
         log_error: standard error of the logarithm of the variance by N grains.
         sample: variance of ln T where some of the grains are tracked.
         first: variance of ln T at t = 0 over `inverse_number`: 0 where T_0 is the run's own.
+        contacts: factor of the variance by contacts of soft spheres: 0 for a model without them.
     """
 
     inverse_number: float
     log_error: float
     sample: float = 0.0
     first: float = 0.0
+    contacts: float = 1.0
 
 
 class Noise(NamedTuple):
@@ -103,6 +105,7 @@ class Noise(NamedTuple):
         rate_error: relative standard error of theory's cooling rate at the nodes, shape (nodes,).
         sample: variance of ln T by the sampling of some of the grains.
         white: relative standard deviation of further errors of T, independent at each time.
+        contacts: factor of the variance by contacts of soft spheres.
     """
 
     inverse_number: Any
@@ -110,6 +113,7 @@ class Noise(NamedTuple):
     rate_error: Any
     sample: Any
     white: Any
+    contacts: Any = 1.0
 
 
 class RateError(NamedTuple):
@@ -249,6 +253,7 @@ class CurveRows:
             rate_error=model * np.interp(times, *self.rate_error),
             sample=np.asarray(self.grains.sample),
             white=np.asarray(white),
+            contacts=np.asarray(self.grains.contacts),
         )
 
     def with_wider_rate_error(self, error: float) -> "CurveRows":

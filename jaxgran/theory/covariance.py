@@ -163,9 +163,8 @@ def run_covariance(
     contacts = contact_noise(gas, mean.log_temperature) if softness else None
     if contacts is None:
         return whole
-    later = slice(1, theta.size)
-    by_contacts = contact_covariance(contacts, mean.collisions)[later, later]
-    return whole.at[later, later].add(by_contacts)
+    of_T = slice(0, theta.size)
+    return whole.at[of_T, of_T].add(contact_covariance(contacts, mean.collisions))
 
 
 def run_process(

@@ -2,6 +2,7 @@
 
 import json
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -32,7 +33,9 @@ def test_single_numbers_of_numpy_become_those_of_python():
         assert restored(value) == expected and type(restored(value)) is type(expected)
 
 
-@pytest.mark.parametrize("value", [1j, np.complex64(1j), {1, 2}, len, np.array([1j])])
+@pytest.mark.parametrize(
+    "value", [1j, np.complex64(1j), {1, 2}, len, np.array([1j]), np.array(["a"]), jax.random.key(0)]
+)
 def test_other_objects_are_refused(value):
     with pytest.raises(NotStorable):
         to_json(value)

@@ -39,9 +39,14 @@ def test_constants_are_those_of_an_elastic_contact():
     times, share, _ = missing_energy(0.0)
     mean = np.trapezoid(share, times) / times[-1]
     square = np.trapezoid(share**2, times) / times[-1]
-    impacts = scipy.special.gamma(2.9) / scipy.special.gamma(0.9)
-    assert pytest.approx(2 * impacts * square, rel=5e-3) == CONTACT_VARIANCE
-    assert pytest.approx(mean**2 / (2 * square), rel=0.01) == CONTACT_MEMORY
+    # Energies of impacts over m T, each of which lasts energy^(-1/10), over their mean duration.
+    energy = np.linspace(0.0, 50.0, 200_001)[1:]
+    duration = energy**-0.1 / scipy.special.gamma(0.9)
+    weight = np.exp(-energy) * energy**2 * duration
+    variance = 2 * square * np.trapezoid(weight, energy)
+    assert pytest.approx(variance, rel=5e-3) == CONTACT_VARIANCE
+    longer = np.trapezoid(weight * duration, energy) / np.trapezoid(weight, energy)
+    assert pytest.approx(longer * mean**2 / (2 * square), rel=0.01) == CONTACT_MEMORY
 
 
 @pytest.mark.parametrize("dissipation", [0.1, 0.3, 0.5])
@@ -65,7 +70,8 @@ def test_only_soft_spheres_have_contacts():
     assert contacts is not None
     shorter = np.exp(-0.4)  # t_c/tau_c is in proportion to T^(2/5)
     np.testing.assert_allclose(contacts.memory[1] / contacts.memory[0], shorter)
-    assert float(contacts.memory[0]) == pytest.approx(0.3 * float(gas.contact_fraction))
+    memory = CONTACT_MEMORY * float(gas.contact_fraction)
+    assert float(contacts.memory[0]) == pytest.approx(memory)
 
 
 def test_contacts_scatter_a_run_of_soft_spheres_from_its_start_on():
