@@ -123,10 +123,11 @@ def _correlations(steps: list[Step]) -> _Correlations:
     for lag in (1, 2):
         for k, (one, two) in enumerate(zip(steps, steps[lag:], strict=False)):
             _, i, j = np.intersect1d(one.ids, two.ids, assume_unique=True, return_indices=True)
+            if len(i) < MIN_TRACKS:
+                continue
             a, b = (x - x.mean(axis=0) for x in (one.displacement[i], two.displacement[j]))
-            if len(i) >= MIN_TRACKS:
-                correlation = np.sum(a * b) / np.sqrt(np.sum(a**2) * np.sum(b**2))
-                rows.append((k, k + lag, correlation, np.sqrt(a.size)))
+            correlation = np.sum(a * b) / np.sqrt(np.sum(a**2) * np.sum(b**2))
+            rows.append((k, k + lag, correlation, np.sqrt(a.size)))
     first, second, correlation, weight = np.array(rows).reshape(-1, 4).T
     return _Correlations(first.astype(int), second.astype(int), correlation, weight)
 

@@ -37,6 +37,23 @@ def inverse(information: np.ndarray) -> np.ndarray:
     return axes / np.maximum(values, MIN_EIGENVALUE) @ axes.T
 
 
+def resolved_inverse(
+    information: Float[np.ndarray, "p p"], resolution: float
+) -> Float[np.ndarray, "p p"]:
+    """Return the covariance of parameters in the combinations that data determine, 0 in others.
+
+    With each parameter scaled to a sensitivity of 1, these are the combinations whose sensitivity
+    is above a share of the largest one.
+
+    Args:
+        information: on the parameters.
+        resolution: the share.
+    """
+    size = np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+    scale = np.outer(size, size)
+    return np.linalg.pinv(information / scale, rcond=resolution**2, hermitian=True) / scale
+
+
 def information_by_source(solution: Solution) -> dict[str, np.ndarray]:
     """Return the information on all unknowns, as the variance of the estimate's score by source.
 

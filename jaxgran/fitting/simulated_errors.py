@@ -10,6 +10,7 @@ from jaxtyping import Float
 from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.measurement import Priors
+from jaxgran.fitting.information import resolved_inverse
 from jaxgran.fitting.parameters import SMOOTHNESS
 from jaxgran.fitting.prior_effects import prior_effects
 from jaxgran.fitting.rows import (
@@ -115,9 +116,8 @@ def covariances_of(
     smoothness = _smoothness_slopes(estimate)
     sensitivity = estimate.expansion.sensitivity
     information = sensitivity.T @ sensitivity + smoothness.T @ smoothness
-    resolution = estimate.sims.model.derivative_accuracy
     # The change of the estimate, SI, with the derivatives of ln L.
-    gain = estimate.scale * np.linalg.pinv(information, rcond=resolution**2)
+    gain = estimate.scale * resolved_inverse(information, estimate.sims.model.derivative_accuracy)
     parts = _parts_of_data(estimate, gain)
     parts[SIMULATION] = estimate.scale * estimate.search.average.noise * estimate.scale.T
     parts[SMOOTHNESS] = gain @ smoothness.T @ smoothness @ gain.T

@@ -21,7 +21,7 @@ from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.run_options import Run
 from jaxgran.fitting.comparison import Comparison
 from jaxgran.fitting.descent import Descent, Loss
-from jaxgran.fitting.information import decrease_with_variance, inverse
+from jaxgran.fitting.information import decrease_with_variance, inverse, resolved_inverse
 from jaxgran.fitting.parameters import with_parameters
 from jaxgran.fitting.prediction import predicted_curve
 from jaxgran.fitting.problem import Problem
@@ -236,7 +236,7 @@ class Simulations:
         columns = np.concatenate([difference[:, None], slope, s.deviation.T], axis=1)
         whitened = comparison.whiten(columns)
         difference, slope, deviation = np.split(whitened, [1, 1 + p], axis=1)
-        gain = np.linalg.pinv(slope, rcond=self.model.derivative_accuracy)
+        gain = resolved_inverse(slope.T @ slope, self.model.derivative_accuracy) @ slope.T
         replicas = deviation.shape[1]
         shift = gain @ deviation / (replicas * (replicas - 1)) ** 0.5
         return _Estimate(s.flat + (gain @ difference)[:, 0], shift @ shift.T)
@@ -256,8 +256,7 @@ class Simulations:
         number = getattr(self.model, "num_particles", None)
         if number is None:
             return None
-        resolution = self.model.derivative_accuracy
-        covariance = np.linalg.pinv(information, rcond=resolution**2, hermitian=True)
+        covariance = resolved_inverse(information, self.model.derivative_accuracy)
         by_grains = covariance @ information_by(comparison, slope, FEW_PARTICLES) @ covariance
         return by_grains / (comparison.curve.rows.grains.inverse_number * number * replicas)
 

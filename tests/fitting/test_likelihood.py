@@ -15,7 +15,7 @@ from jaxgran.fitting.prediction import predicted_curve
 from jaxgran.fitting.rows import Noise
 from jaxgran.fitting.search import minimise
 from jaxgran.fitting.setup import Request, build_problem, problem_with_rate_errors
-from tests.beads import glass_beads
+from tests.beads import glass_beads, soft_beads
 from tests.fitting.curves import NUM_PARTICLES, A, cooled_beads, drawn
 
 THEORY = jaxgran.KineticTheory()
@@ -112,3 +112,32 @@ def test_the_error_of_a_sample_of_grains_is_remembered():
     assert np.sum(innovation**2 / of_innovation) == pytest.approx(square, rel=1e-8)
     determinant = np.linalg.slogdet(covariance)[1]
     assert np.sum(np.log(of_innovation)) == pytest.approx(determinant, rel=1e-8)
+
+
+@pytest.mark.slow
+def test_the_filter_has_the_covariance_of_soft_spheres():
+    gas = soft_beads(0.1, 0.3)
+    taus = np.concatenate([[0.0, 0.02], np.geomspace(0.05, 20.0, 40)])
+    times = taus * float(gas.mean_free_time)
+    curve = jaxgran.cool(gas, times)
+
+    def one(x):
+        return jnp.asarray(x)[:, None]
+
+    log_T = one(jnp.log(curve.temperature))
+    nodes = Nodes(log_T, 0 * log_T, curve.sonine, one(curve.collisions))
+    residual = 0.01 * np.random.default_rng(0).normal(size=times.size)
+    residuals = np.zeros((times.size, 2, 1, 1))
+    residuals[:, 0, 0, 0] = residual
+    error = 1e-3
+    variances = np.full((times.size, 2, 1), error**2)
+    used = np.repeat([[1.0, 0.0]], times.size, axis=0)
+    zero = jnp.zeros(())
+    noise = Noise(jnp.full(1, 1 / 250), zero, jnp.zeros(times.size), zero, zero)
+    batch = jax.tree.map(lambda x: jnp.asarray(x)[None], gas)
+    arguments = nodes, residuals, variances, jnp.ones_like(log_T), used, noise
+    found, spread = filtered(batch, *jax.tree.map(jnp.asarray, arguments))
+    square = np.sum(np.asarray(found)[:, 0, 0, 0] ** 2 / np.asarray(spread)[:, 0, 0])
+    C = np.asarray(THEORY.covariance(gas, times, 250)) + error**2 * np.eye(times.size)
+    # Both interpolate rates, between these nodes and between 97 times.
+    assert square == pytest.approx(residual @ np.linalg.solve(C, residual), rel=0.02)

@@ -50,6 +50,24 @@ def test_a_good_fit_through_particles_is_consistent(seed):
     assert in_range(result, gas.value(A))
 
 
+@pytest.mark.slow
+def test_an_exact_first_temperature_hides_no_other_parameter():
+    # Next to its sensitivity A counted as not determined: it stayed at its guess, without an error.
+    gas = glass_beads(0.15)
+    times = np.append(0.0, np.geomspace(1.0, 60.0, 20)) * float(gas.mean_free_time)
+    curve = jaxgran.cool(gas, times)
+    curve = jaxgran.CoolingCurve(curve.times, curve.temperature)
+    measurement = jaxgran.Measurement(gas, curve, num_particles=1000)
+    model = jaxgran.DSMC(1000, replicas=4)
+    both, alone = (
+        jaxgran.fit(measurement, free=free, model=model, quick=True, progress=False)
+        for free in (BOTH, (A,))
+    )
+    assert float(both.estimate[1]) == pytest.approx(float(gas.temperature), rel=1e-4)
+    assert float(both.standard_error[0]) == pytest.approx(float(alone.standard_error[0]), rel=0.3)
+    assert deviation(both, gas) < 3
+
+
 @pytest.mark.minutes
 @pytest.mark.slow
 def test_fit_through_soft_spheres_finds_what_made_the_curve():
