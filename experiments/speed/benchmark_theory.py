@@ -60,7 +60,7 @@ from jaxgran.scene.laws import _CLIPPED, C1
 from jaxgran.theory.averages import averaging_matrix
 
 CURVE = EXAMPLE_FILES["dilute"]
-TASKS = "reference", "fit", "lengths", "command", "SoftSpheres", "HardSpheres", "DSMC"
+TASKS = "reference", "fit", "lengths", "plan", "command", "SoftSpheres", "HardSpheres", "DSMC"
 RTOL, SCIPY_RTOL = 1e-7, 1e-9  # both give the same accuracy
 REFERENCE = "first Jacobian"
 SAME_EQUATIONS = {"order": 2, "corrections": {"sonine", "diffusion", "spin_cumulants"}}
