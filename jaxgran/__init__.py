@@ -66,7 +66,7 @@ from jaxgran.scene.laws import RestitutionSeries as RestitutionSeries
 from jaxgran.scene.laws import RestitutionSpline as RestitutionSpline
 from jaxgran.scene.laws import Viscoelastic as Viscoelastic
 from jaxgran.scene.laws import viscoelastic_restitution as viscoelastic_restitution
-from jaxgran.sweep import sweep as sweep
+from jaxgran.sweeps import sweep as sweep
 from jaxgran.theory.steady_states import SteadyState as SteadyState
 from jaxgran.theory.steady_states import steady_state as steady_state
 

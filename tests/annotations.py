@@ -22,7 +22,7 @@ UNCHECKED = {
     "scene.elements": {"_wall_law"},
     "scene.gas": {"Gas.replace", "Gas.restitution", "_checked_law"},
     "scene.geometry": {"sphere_mass"},
-    "sweep": {"sweep"},
+    "sweeps": {"sweep"},
 }
 """Functions, by module, that check their arguments themselves and raise clearer errors."""
 

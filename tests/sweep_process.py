@@ -33,7 +33,7 @@ def main(port, index, processes, store, number, die_at=-1):
     jax.distributed.initialize(address, processes, index, heartbeat_timeout_seconds=seconds)
     import jaxgran
 
-    gases, module = members(number), sys.modules["jaxgran.sweep"]
+    gases, module = members(number), sys.modules["jaxgran.sweeps"]
     values, run_chunk = gases.value("dissipative_constant").tolist(), module._run_chunk
 
     def reported(models, members, *rest):

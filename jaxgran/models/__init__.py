@@ -11,5 +11,5 @@
 
 No module outside this package knows a model by its class, except for the default.
 
-May import: _utils, scene, data, theory, gradients, particles. Imported by: fitting, sweep, cli.
+May import: _utils, scene, data, theory, gradients, particles. Imported by: fitting, sweeps, cli.
 """

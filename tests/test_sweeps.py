@@ -192,7 +192,7 @@ def test_members_that_fail_are_nan_and_do_not_end_the_others():
 
 
 def test_gases_share_one_search_for_pairs():
-    sized_for_all = sys.modules["jaxgran.sweep"]._sized_for_all
+    sized_for_all = sys.modules["jaxgran.sweeps"]._sized_for_all
     model = jaxgran.HardSpheres(5000)
     dilute, dense = (hard_gas(packing_fraction=phi) for phi in (0.05, 0.4))
     assert [model.sized_for(gas)._sizes.engine for gas in (dilute, dense)] == ["sweep", "cells"]
@@ -204,7 +204,7 @@ def test_gases_share_one_search_for_pairs():
 
 @pytest.mark.minutes  # programs of particles are compiled
 def test_a_chunk_is_run_again_if_a_member_overflows_its_arrays(monkeypatch):
-    module = sys.modules["jaxgran.sweep"]
+    module = sys.modules["jaxgran.sweeps"]
     sized_for_all = module._sized_for_all
 
     def short_below_1(model, gases, spare):
