@@ -29,6 +29,7 @@ from jaxgran.fitting.rows import FEW_PARTICLES, CurveRows
 from jaxgran.fitting.search import Trace
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.kinetic_theory import KineticTheory
+from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.scene.gas import Gas
 
 MAX_STEP = 0.7
@@ -194,8 +195,9 @@ class Simulations:
     def with_noise(self, near: list[Simulation]) -> CurveRows:
         """Return the measured curve for kinetic theory, with the noise of a mean of simulations.
 
-        Simulated grains scatter as measured ones do. Where a model does not know its number of
-        grains, the noise is that of its replicas, independent at each time.
+        Simulated grains scatter as measured ones do, but for contacts, which only soft spheres
+        have. Where a model does not know its number of grains, the noise is that of its replicas,
+        independent at each time.
         """
         number = getattr(self.model, "num_particles", None)
         if number is None:
@@ -204,7 +206,11 @@ class Simulations:
         simulated = number * sum(len(s.deviation) for s in near)
         grains = self.theory.grains
         inverse_number = grains.inverse_number + 1 / simulated
-        return replace(self.theory, grains=grains._replace(inverse_number=inverse_number))
+        contacts = grains.contacts
+        if not isinstance(self.model, SoftSpheres):
+            contacts *= grains.inverse_number / inverse_number
+        grains = grains._replace(inverse_number=inverse_number, contacts=contacts)
+        return replace(self.theory, grains=grains)
 
     def average(self, near: list[Simulation]) -> Average:
         """Return the mean of the Gauss-Newton estimates of some simulations, the newest last."""

@@ -11,6 +11,7 @@ import pytest
 
 import jaxgran
 from jaxgran.fitting import simulated_fit
+from jaxgran.fitting.simulations import Simulation
 from tests.beads import glass_beads, soft_beads
 from tests.fitting.curves import BOTH, A, deviation, in_range, rough_beads, synthetic
 from tests.fitting.curves import fitted as fit_measured
@@ -227,6 +228,18 @@ def test_simulations_scatter_as_theory_expects(begun):
     ratio = np.var(moved, axis=0, ddof=1) / np.mean(expected, axis=0)
     # The variance of 80 values is known to 16 %.
     np.testing.assert_allclose(ratio, 1.0, atol=3 * 0.16)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [jaxgran.DSMC, jaxgran.SoftSpheres])
+def test_contacts_scatter_what_was_measured_and_soft_spheres(begun, kind):
+    sims, flat = begun(kind(100, replicas=2), num_particles=300)
+    of_two_replicas = Simulation(flat, flat, flat[None], np.zeros((2, 1)), flat)
+    grains = sims.with_noise([of_two_replicas]).grains
+    assert grains.inverse_number == pytest.approx(1 / 300 + 1 / 200)
+    by_contacts = grains.inverse_number * grains.contacts
+    expected = grains.inverse_number if kind is jaxgran.SoftSpheres else 1 / 300
+    assert by_contacts == pytest.approx(expected)
 
 
 class OneRun(StandIn):
