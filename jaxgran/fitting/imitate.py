@@ -28,7 +28,6 @@ from jaxgran.models.cool import cool
 from jaxgran.models.dsmc import DSMC
 from jaxgran.models.hard_spheres import HardSpheres
 from jaxgran.models.kinetic_theory import KineticTheory
-from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.parameters import symbol_of
 
@@ -288,7 +287,7 @@ def _times_since_start(measurement: Measurement, result: Fit) -> Float[Array, "t
 def _theory_of(model: AbstractModel) -> KineticTheory:
     """Return kinetic theory of the gas that a model simulates."""
     without = set()
-    if not isinstance(model, SoftSpheres):
+    if not model.has_contacts:
         without.add("softness")
     if isinstance(model, DSMC):
         without.add("correlations")

@@ -237,13 +237,12 @@ def _used(
 def _grains(measurement: Measurement, model: AbstractModel, fits_T_0: bool) -> Grains:
     N = measurement.num_particles
     is_ensemble = measurement.ensemble_start and not fits_T_0
-    is_hard = isinstance(model, KineticTheory) and "softness" not in model.corrections
     return Grains(
         inverse_number=1 / ((UNKNOWN_NUMBER if N is None else N) * measurement.replicas),
         log_error=WEAK_SCATTER if N is None else SCATTER_ERROR,
         sample=sampling_variance(measurement, measurement.gas.dimension),
         first=2 / measurement.gas.dimension if is_ensemble else 0.0,
-        contacts=0.0 if is_hard else 1.0,
+        contacts=float(model.has_contacts),
     )
 
 

@@ -239,7 +239,7 @@ def _explanations(
     flat = search.average.flat
     start = first.copy()
     start[: flat.size] = flat
-    # Errors are those of the particles, on whose curve the shift places theory.
+    # The shift places theory on the curve of the particles, whose errors count.
     of_particles = search.average.comparison.curve.rows
     rows = replace(
         problem.curves[0],

@@ -29,7 +29,6 @@ from jaxgran.fitting.rows import FEW_PARTICLES, CurveRows
 from jaxgran.fitting.search import Trace
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.kinetic_theory import KineticTheory
-from jaxgran.models.soft_spheres import SoftSpheres
 from jaxgran.scene.gas import Gas
 
 MAX_STEP = 0.7
@@ -196,8 +195,8 @@ class Simulations:
         """Return the measured curve for kinetic theory, with the noise of a mean of simulations.
 
         Simulated grains scatter as measured ones do, but for contacts, which only soft spheres
-        have. Where a model does not know its number of grains, the noise is that of its replicas,
-        independent at each time.
+        have. Where a model does not know its number of grains, the scatter of its replicas gives
+        the noise, independent at each time.
         """
         number = getattr(self.model, "num_particles", None)
         if number is None:
@@ -207,7 +206,7 @@ class Simulations:
         grains = self.theory.grains
         inverse_number = grains.inverse_number + 1 / simulated
         contacts = grains.contacts
-        if not isinstance(self.model, SoftSpheres):
+        if not self.model.has_contacts:
             contacts *= grains.inverse_number / inverse_number
         grains = grains._replace(inverse_number=inverse_number, contacts=contacts)
         return replace(self.theory, grains=grains)

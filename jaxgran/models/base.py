@@ -227,6 +227,11 @@ class AbstractModel(eqx.Module):
         return None
 
     @property
+    def has_contacts(self) -> bool:
+        """Whether contacts of its spheres hold energy, which scatters T; False by default."""
+        return False
+
+    @property
     def name(self) -> str:
         """Name of the model in a sentence: "soft spheres" for `SoftSpheres`."""
         words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(self).__name__).split()

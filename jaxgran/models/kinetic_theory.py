@@ -484,6 +484,11 @@ class KineticTheory(AbstractModel):
         contacts = limitations_of_instant_impacts(gas, consequence)
         return contacts + limitations_of_homogeneity(gas, num_particles)
 
+    @property
+    def has_contacts(self) -> bool:
+        """Whether softness is among the corrections."""
+        return "softness" in self.corrections
+
     def rotation_accuracy(self, gas: Gas) -> Any:
         """Relative accuracy of T_rot/T: 3 % (3D) and 5 % (2D), 15 % between walls (see
         `ROUGH_WALL_ERROR`), and 20 % of spheres that slide where they rotated at t = 0 or the walls

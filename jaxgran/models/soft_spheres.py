@@ -192,6 +192,11 @@ class SoftSpheres(AbstractSpheres):
         """Estimated relative error of T by time steps and noise."""
         return math.hypot(INTEGRATION_ERROR, *self.noise(error_model))
 
+    @property
+    def has_contacts(self) -> bool:
+        """True."""
+        return True
+
     def rate_error(self, error_model: ErrorModel) -> float:
         """Relative error of the cooling rate by time steps."""
         return INTEGRATION_ERROR
