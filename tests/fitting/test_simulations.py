@@ -34,7 +34,7 @@ def test_T_rot_is_fitted_beside_T():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
-def test_a_good_fit_through_particles_is_consistent(seed):
+def test_a_good_fit_through_particles_is_consistent(seed, monkeypatch):
     # Simulations of fewer grains than were measured, whose noise is most of the differences.
     gas = glass_beads(0.15)
     times = np.geomspace(1.0, 60.0, 40) * float(gas.mean_free_time)
@@ -44,7 +44,17 @@ def test_a_good_fit_through_particles_is_consistent(seed):
     measurement = jaxgran.Measurement(gas, curve, num_particles=1000, replicas=4)
     model = jaxgran.DSMC(250, replicas=2)
     key = jax.random.key(10 + seed)
+    compared = []
+    compare = simulated_fit.compare_alternatives
+
+    def compare_and_keep(problem, *args):
+        compared.extend(problem.curves)
+        return compare(problem, *args)
+
+    monkeypatch.setattr(simulated_fit, "compare_alternatives", compare_and_keep)
     result = jaxgran.fit(measurement, free=(A,), model=model, key=key, progress=False)
+    # Of the measured grains, and of 500 in each of at most 20 simulations.
+    assert compared[0].grains.inverse_number >= 1 / 4000 + 1 / (20 * 500)
     assert result.converged and result.p_value > 0.01 and result.smooth_p_value > 0.01
     assert result.grade != "not consistent"
     assert not any(alternative.preferred for alternative in result.alternatives)
