@@ -26,7 +26,7 @@ from jaxgran.particles.hard.dynamics import (
     allowed_overlap,
 )
 from jaxgran.particles.hard.impacts import LawOfReplicas
-from jaxgran.particles.hard.window_length import MIN_IMPACTS
+from jaxgran.particles.hard.window_length import MIN_IMPACTS, longest_window
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import wrap_on_host
 from jaxgran.scene.reduced import SphereScene, reduced_scene, sphere_scene
@@ -34,9 +34,6 @@ from jaxgran.theory.averages import collision_rate
 
 WINDOW_SHARE = 0.05
 """Impacts per particle in a window."""
-
-SKIN_GROWTH = 1.5
-"""Factor by which windows of `MIN_IMPACTS` grow too long: (8/2)^0.3 after a window of two."""
 
 CONTACT_TIMES = Domain(0.0, 0.1, low_allowed=True, high_allowed=True)
 
@@ -213,7 +210,7 @@ class HardSpheres(AbstractSpheres):
         neighbours = self.neighbourhood(scene, d, replicas)
         share = max(WINDOW_SHARE, 2 * MIN_IMPACTS / n)
         fastest = SPEED_MARGIN * (0.5 + (2 * math.log(n)) ** 0.5)  # of Maxwell's n speeds
-        longest = share if share == WINDOW_SHARE else SKIN_GROWTH * share
+        longest = share * longest_window(0.5 * share * n)
         reach = 2 * fastest * longest / neighbours.collision_frequency
         packed = 0.9 + 0.45 * neighbours.in_contact / 2 ** (d - 1)
         near = packed * neighbours.contact_value * neighbours.in_contact * ((1 + reach) ** d - 1)

@@ -25,6 +25,8 @@ MAX_SHARED_ROWS = 128
 SMALL_RUN = 500
 """Number of particles of all replicas below which a run takes less time than a compilation."""
 
+SPARE_ROWS = 16
+"""Rows of each array beyond those that are expected, and five times their scatter."""
 
 GROWTH = 1.3
 """Ratio of neighbouring capacities of arrays that were enlarged."""
@@ -42,7 +44,7 @@ def grid(num_particles: int) -> tuple[float, float]:
     Returns:
         The ratio of neighbouring grid points, see `round_up`, and a factor on the spare capacity.
     """
-    return (1.5, 1.4) if num_particles < SMALL_RUN else (1.03, 1.03**-0.5)
+    return (1.5, 1.2) if num_particles < SMALL_RUN else (1.03, 1.03**-0.5)
 
 
 def round_up(value: float, ratio: float) -> float:
@@ -173,7 +175,7 @@ def capacities(
     counts = [num_particles * x for x in expected]
     spares = (spare**0.5, spare, spare, spare)
     pairs, near, contacts, members = (
-        int(s * x + 5 * x**0.5) + 64 for s, x in zip(spares, counts, strict=True)
+        int(s * x + 5 * x**0.5) + SPARE_ROWS for s, x in zip(spares, counts, strict=True)
     )
     lookahead = around.lookahead_capacity(spare)
     rows = int(num_particles * extra)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-MIN_IMPACTS = 8
+MIN_IMPACTS = 10
 """Smallest number of impacts of two spheres that a window should have, in all replicas together."""
 
 FIRST_WINDOW = 0.125
@@ -22,6 +22,18 @@ The length changes by ``(wanted / executed impacts)^0.3``, as the number of impa
 
 MIN_CHANGE, MAX_CHANGE = 0.5, 1.5
 """Least and largest ratio of the lengths of two successive windows."""
+
+
+def longest_window(num_impacts: float) -> float:
+    """Return the longest window of a run over the mean one.
+
+    It follows a window whose number of impacts is two standard deviations too small.
+
+    Args:
+        num_impacts: mean number of impacts in a window, >= `MIN_IMPACTS`.
+    """
+    fewest = num_impacts - 2 * num_impacts**0.5
+    return (num_impacts / fewest) ** WINDOW_EXPONENT
 
 
 class WindowController(NamedTuple):

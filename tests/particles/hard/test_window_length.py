@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgran.particles.hard.window_length import MIN_IMPACTS, WindowController
+from jaxgran.particles.hard.window_length import MIN_IMPACTS, WindowController, longest_window
 
 
 def next_length(num_impacts, duration=1.0, share=0.1, num_spheres=1000):
@@ -27,3 +27,11 @@ def test_a_window_cut_short_by_an_end_changes_nothing():
 
 def test_few_spheres_still_have_some_impacts_in_each_window():
     np.testing.assert_allclose(next_length(2 * MIN_IMPACTS, num_spheres=20), 1.0)
+
+
+def test_the_longest_window_follows_one_with_few_impacts():
+    rng = np.random.default_rng(0)
+    for mean in (MIN_IMPACTS, 40, 1000):
+        fewest = np.quantile(rng.poisson(mean, 10**5), 0.023)  # two standard deviations
+        after = next_length(int(2 * fewest), share=2 * mean / 1000)
+        np.testing.assert_allclose(after, longest_window(mean), rtol=0.05)
