@@ -3,20 +3,20 @@
 Units are the same as in `jaxgran.theory.averages`; functions of a `Gas` use SI units.
 """
 
-from math import pi, sqrt
+from math import sqrt
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from jaxgran.scene.elements import MAX_WALL_IMPACT_RATIO, NUM_SPIN_COMPONENTS, wall_impact_ratio
 from jaxgran.scene.geometry import impact_average
-from jaxgran.scene.laws import ReducedLaw
 from jaxgran.scene.reduced import ReducedRough, ReducedScene, ReducedWalls
-from jaxgran.theory.averages import ElementBounds, collision_rate, rough_impact_means
+from jaxgran.theory.averages import collision_rate
 from jaxgran.theory.moments import Spins
+from jaxgran.theory.rough_impacts import coulomb_limit, mean_impulse, rough_impact_means
 from jaxgran.theory.sizes import drag_factors, equal_rates
 
 SUPPORTED = ("surface", "container", "drag", "drive", "diameter_sd")
@@ -82,21 +82,6 @@ def element_rates(
     return jax.tree.map(lambda *rates: sum(rates), *parts)
 
 
-TYPICAL_IMPACT = 2 * sqrt(2 / pi)
-"""Mean normal speed of impacts, weighted by itself, in units of sqrt(2 T)."""
-
-
-def mean_impulse(law: ReducedLaw, speed: Float[Array, "*points"]) -> Float[Array, "*points"]:
-    """Return (1 + eps)/2 of the typical impact: the normal impulse over m times the normal speed.
-
-    The cooling of sliding spheres of ice is then right within 2 %.
-    """
-    return (1 + law.restitution(TYPICAL_IMPACT * speed)) / 2
-
-
-MAX_STICKING = 1e6
-"""Bound of the friction over the slip, above which no sphere slides in double precision."""
-
 _STEP = 0.04
 """Steps of variances over S and V: second derivatives are then right to 1e-3."""
 
@@ -115,23 +100,6 @@ _STENCIL = np.array(
     ]
 )[:, None]
 """Steps in T and a, and weights of the differences d_TT, d_Ta, d_aa and d_Taa at these steps."""
-
-
-def coulomb_limit(
-    surface: ReducedRough, eta: Array, impulse: Array, variance: Array
-) -> Float[Array, "..."] | None:
-    """Return m of `slip_moments`, ``mu (1 + eps)/2 / (eta sqrt(V/S))``; None without friction.
-
-    Args:
-        surface: in reduced units.
-        eta: coefficient of `Rough`.
-        impulse: (1 + eps)/2, see `mean_impulse`.
-        variance: V/S, of a component of the slip over one of the relative velocity.
-    """
-    if surface.friction is None:
-        return None
-    slip = jnp.sqrt(variance) * jnp.maximum(eta, 1e-9)
-    return jnp.minimum(surface.friction * impulse / slip, MAX_STICKING)
 
 
 def rough_impact_rates(
@@ -264,6 +232,9 @@ def _wall_rates(
     by_axis = jax.vmap(axis_rates)(walls.frequency)
     return jax.tree.map(lambda x: speed * jnp.sum(x), by_axis)
 
+
+ElementBounds = tuple[ArrayLike, ArrayLike, ArrayLike | None, ArrayLike | None]
+"""Bounds of the effects of elements on T, see `element_bounds`."""
 
 MAX_SPEED_FACTOR = 1.2
 """Bound of ``1 + 3 a_2/8``, the factor of losses at walls."""
