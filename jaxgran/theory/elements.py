@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from jaxgran.scene.elements import MAX_WALL_IMPACT_RATIO, NUM_SPIN_COMPONENTS, wall_impact_ratio
 from jaxgran.scene.geometry import impact_average
@@ -233,11 +233,25 @@ def _wall_rates(
     return jax.tree.map(lambda x: speed * jnp.sum(x), by_axis)
 
 
-ElementBounds = tuple[ArrayLike, ArrayLike, ArrayLike | None, ArrayLike | None]
-"""Bounds of the effects of elements on T, see `element_bounds`."""
-
 MAX_SPEED_FACTOR = 1.2
 """Bound of ``1 + 3 a_2/8``, the factor of losses at walls."""
+
+
+class ElementBounds(NamedTuple):
+    """Upper bounds of the cooling and the heating by the elements of a scene.
+
+    Attributes:
+        cooling_over_speed: of the part of ``-d ln T/dt`` that grows with sqrt(T), over sqrt(T/T_0).
+        constant_cooling: of the part of ``-d ln T/dt`` that does not depend on T.
+        heating: of d(T/T_0)/dt by a drive; None where T never rises.
+        energy_gain: of T/T_0 gained from the spins of rough spheres or, where sizes differ, from
+            the large spheres; None where neither exists.
+    """
+
+    cooling_over_speed: Any = 0.0
+    constant_cooling: Any = 0.0
+    heating: Any = None
+    energy_gain: Any = None
 
 
 def element_bounds(scene: ReducedScene, dimension: int) -> ElementBounds:
@@ -245,47 +259,46 @@ def element_bounds(scene: ReducedScene, dimension: int) -> ElementBounds:
 
     Spheres that do not rotate, and that stop at walls, cool fastest. The rotation heats at most by
     the initial energy of the spins.
-
-    Returns:
-        the part of ``-d ln T/dt`` over sqrt(T/T_0); its part that does not depend on T; d(T/T_0)/dt
-        by a drive, None where nothing heats; T/T_0 that a gas could gain from the spins, None for
-        smooth spheres.
     """
     d = dimension
     rate = collision_rate(0.0, d)
     surface = scene.surface
     walls = scene.walls
-    by_speed = 0.0
-    constant = 0.0
+    cooling_over_speed = 0.0
+    constant_cooling = 0.0
     heating = None
-    rotation = None
-
-    def friction(surface: ReducedRough, eta: Array, rate: Array) -> Array:
-        return rate * 2 * (d - 1) / d * (eta - eta**2)
-
+    energy_gain = None
     if surface is not None:
-        by_speed = by_speed + friction(surface, surface.eta, rate)
+        tangential = _max_tangential_cooling(surface.eta, rate, d)
+        cooling_over_speed = cooling_over_speed + tangential
         heating = jnp.zeros(())
-        rotation = NUM_SPIN_COMPONENTS[d] / d * surface.ratio
+        energy_gain = NUM_SPIN_COMPONENTS[d] / d * surface.ratio
     if walls is not None:
         frequency = walls.frequency / rate
-        share = wall_impact_ratio(jnp.zeros_like(frequency), frequency, d)
-        bound = 2 / d * MAX_SPEED_FACTOR * jnp.sum(walls.frequency * share)
+        ratio = wall_impact_ratio(jnp.zeros_like(frequency), frequency, d)
+        at_walls = 2 / d * MAX_SPEED_FACTOR * jnp.sum(walls.frequency * ratio)
         if surface is not None and walls.surface is not None:
-            most = 2 * MAX_WALL_IMPACT_RATIO * jnp.sum(walls.frequency)
-            bound += friction(surface, surface.eta_on_wall(walls.surface) / 2, most)
-        by_speed = by_speed + bound
+            wall_rate = 2 * MAX_WALL_IMPACT_RATIO * jnp.sum(walls.frequency)
+            eta = surface.eta_on_wall(walls.surface) / 2
+            at_walls = at_walls + _max_tangential_cooling(eta, wall_rate, d)
+        cooling_over_speed = cooling_over_speed + at_walls
     if scene.drag is not None:
-        constant = 2 * scene.drag.rate
+        constant_cooling = 2 * scene.drag.rate
     if scene.sizes is not None:
         # Impacts cool at most twice as fast, and small spheres have at most all of the energy.
         one = jnp.ones_like(scene.sizes.spread)
-        by_speed = by_speed - equal_rates(scene.law, one, 0.0, d)
+        cooling_over_speed = cooling_over_speed - equal_rates(scene.law, one, 0.0, d)
         small, large = scene.sizes.masses
         heating = jnp.zeros(())
-        rotation = (large - small) / (2 * small)
+        energy_gain = (large - small) / (2 * small)
         if scene.drag is not None:
-            constant = constant * drag_factors(scene.sizes)[0]
+            drag_factor_of_small, _ = drag_factors(scene.sizes)
+            constant_cooling = constant_cooling * drag_factor_of_small
     if scene.drive is not None:
         heating = scene.drive
-    return by_speed, constant, heating, rotation
+    return ElementBounds(cooling_over_speed, constant_cooling, heating, energy_gain)
+
+
+def _max_tangential_cooling(eta: Array, rate: Array, d: int) -> Array:
+    """Bound of ``-d ln T/dt`` by the tangential impulses, of spheres without spin that stick."""
+    return rate * 2 * (d - 1) / d * (eta - eta**2)

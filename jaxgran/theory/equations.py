@@ -106,8 +106,9 @@ class Equations(NamedTuple):
         averages = partial(
             impact_moments, law, dimension=d, order=self.order, relaxation=self.spreading
         )
-        ends = log_temperature_range(law, duration, d, element_bounds(scene[0], d))
-        return RateTable.from_function(averages, *ends, law.num_nodes)
+        bounds = element_bounds(scene[0], d)
+        lowest, highest = log_temperature_range(law, duration, d, bounds)
+        return RateTable.from_function(averages, lowest, highest, law.num_nodes)
 
     def derivative(
         self,

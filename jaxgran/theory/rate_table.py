@@ -114,10 +114,12 @@ def log_temperature_range(
     law: ReducedLaw,
     duration: Float[Array, ""],
     dimension: int,
-    bounds: ElementBounds = (0.0, 0.0, None, None),
+    bounds: ElementBounds,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Bounds of ln(T/T_0) within a reduced time, the lower one negative and not far below the true
-    value, the upper one 0, or positive where the gas is heated. They have no derivatives.
+    """Return bounds of ln(T/T_0) within a reduced time; they have no derivatives.
+
+    The lower bound is negative, and not far below the lowest value. The upper bound is 0, or
+    positive where the gas is heated.
 
     The first lower bound is Haff's law for e = 0 with 10 % added to the rate. A law with small
     losses at low speed cools much less; a series over the whole range would lose digits. Therefore
@@ -133,34 +135,36 @@ def log_temperature_range(
         law: law of restitution in units of `Gas.impact_speed`.
         duration: reduced time.
         dimension: d.
-        bounds: of the effects of the elements of the scene on T (`element_bounds`); by default for
-            smooth spheres without walls, drag and drive.
+        bounds: of the cooling and the heating by the elements of the scene, see `element_bounds`.
     """
     law, duration, bounds = jax.lax.stop_gradient((law, duration, bounds))
-    by_speed, constant, heating, rotation = bounds
-
-    def scan_to(bound: Array) -> tuple[Array, Array, Array]:
-        scan = bound * jnp.linspace(0, 1, _SCAN_POINTS, dtype=bound.dtype)
-        speeds = jnp.exp(scan / 2)
-        return scan, speeds, collisions / 2 * jax.vmap(partial(mean_inelasticity, law))(speeds)
-
     collisions = sphere_surface(dimension) / sqrt(2 * pi)
-    haff = 1.1 * collisions / (2 * dimension) + by_speed / 2
-    bound = -2 * jnp.log1p(haff * duration) - constant * duration
-    scan, speeds, loss = scan_to(bound)
-    rate = 2.2 / dimension * loss * speeds + by_speed * speeds + constant
-    if heating is not None:
-        rate = rate - heating / speeds**2
-    rate = jnp.maximum(rate, jnp.finfo(bound.dtype).tiny)
-    earliest = jnp.cumsum(-jnp.diff(scan) / jnp.maximum(rate[1:], rate[:-1]))
-    reached = jnp.min(jnp.where(earliest < duration, scan[1:], 0.0))
-    lowest = jnp.minimum(jnp.maximum(reached + scan[1], bound), -1e-3)
-    if heating is None:
+
+    def scan_to(end: Array) -> tuple[Array, Array, Array]:
+        """ln(T/T_0) from 0 to an end, sqrt(T/T_0), and the loss of energy over sqrt(T/T_0)."""
+        log_theta = end * jnp.linspace(0, 1, _SCAN_POINTS, dtype=end.dtype)
+        speeds = jnp.exp(log_theta / 2)
+        losses = collisions / 2 * jax.vmap(partial(mean_inelasticity, law))(speeds)
+        return log_theta, speeds, losses
+
+    fastest = 1.1 * collisions / (2 * dimension) + bounds.cooling_over_speed / 2
+    lowest = -2 * jnp.log1p(fastest * duration) - bounds.constant_cooling * duration
+    log_theta, speeds, losses = scan_to(lowest)
+    rate = 2.2 / dimension * losses * speeds
+    rate = rate + bounds.cooling_over_speed * speeds + bounds.constant_cooling
+    if bounds.heating is not None:
+        rate = rate - bounds.heating / speeds**2
+    rate = jnp.maximum(rate, jnp.finfo(rate.dtype).tiny)
+    earliest = jnp.cumsum(-jnp.diff(log_theta) / jnp.maximum(rate[1:], rate[:-1]))
+    reached = jnp.min(jnp.where(earliest < duration, log_theta[1:], 0.0))
+    lowest = jnp.minimum(jnp.maximum(reached + log_theta[1], lowest), -1e-3)
+    if bounds.heating is None:
         return lowest, jnp.zeros_like(lowest)
-    bound = jnp.log1p(heating * duration + (0.0 if rotation is None else rotation))
-    if rotation is None:
-        scan, speeds, loss = scan_to(bound)
-        balanced = loss / dimension * speeds >= heating / speeds**2
-        stop = jnp.min(jnp.where(balanced, scan, bound))
-        bound = jnp.minimum(bound, stop + scan[1])
-    return lowest, jnp.maximum(bound, 1e-3)
+    energy_gain = 0.0 if bounds.energy_gain is None else bounds.energy_gain
+    highest = jnp.log1p(bounds.heating * duration + energy_gain)
+    if bounds.energy_gain is None:
+        log_theta, speeds, losses = scan_to(highest)
+        is_balanced = losses / dimension * speeds >= bounds.heating / speeds**2
+        balance = jnp.min(jnp.where(is_balanced, log_theta, highest))
+        highest = jnp.minimum(highest, balance + log_theta[1])
+    return lowest, jnp.maximum(highest, 1e-3)

@@ -9,6 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran.theory.averages import impact_moments
+from jaxgran.theory.elements import ElementBounds
 from jaxgran.theory.rate_table import RateTable, log_temperature_range
 from tests.beads import glass_beads
 
@@ -26,7 +27,7 @@ def test_rate_table_is_exact_over_decades():
     for law in laws:
         for duration, tolerance in ((1e-3, 1e-11), (1.0, 1e-11), (1e5, 1e-11), (1e12, 1e-7)):
             direct = partial(impact_moments, law, dimension=3)
-            ends = log_temperature_range(law, jnp.asarray(duration), 3)
+            ends = log_temperature_range(law, jnp.asarray(duration), 3, ElementBounds())
             table = RateTable.from_function(direct, *ends, law.num_nodes)
             x = jnp.linspace(table.lowest, 0.0, 300)
             error = jax.vmap(table)(x)[:, 0, 0] / jax.vmap(direct)(jnp.exp(x / 2))[:, 0, 0] - 1
