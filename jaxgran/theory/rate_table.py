@@ -18,9 +18,6 @@ from jaxgran.scene.laws import ReducedLaw
 from jaxgran.theory.averages import mean_inelasticity
 from jaxgran.theory.elements import ElementBounds
 
-_SCAN_POINTS = 16
-"""Temperatures at which the cooling rate is computed to determine the range of a `RateTable`."""
-
 
 class RateTable(eqx.Module):
     """Averages over the impacts of one gas (`impact_moments`) as a Chebyshev series in ln T.
@@ -72,7 +69,8 @@ class RateTable(eqx.Module):
                 polynomials.append(2 * x * polynomials[-1] - polynomials[-2])
             return jnp.tensordot(jnp.stack(polynomials), self.coefficients, 1)
         # Clenshaw's recurrence, from the highest term down.
-        last = before = jnp.zeros_like(self.coefficients[0])
+        last = jnp.zeros_like(self.coefficients[0])
+        before = last
         for row in self.coefficients[:0:-1]:
             last, before = row + 2 * x * last - before, last
         return self.coefficients[0] + x * last - before
@@ -90,9 +88,10 @@ class RateTable(eqx.Module):
         derivative = jnp.asarray(_derivative_matrix(len(self.coefficients)), self.lowest.dtype)
         width = self.highest - self.lowest
         slope = jnp.tensordot(derivative, self.coefficients, 1) * 2 / width
-        both = jnp.stack([self.coefficients, slope], axis=1)
+        function_and_slope = jnp.stack([self.coefficients, slope], axis=1)
         derivatives = jnp.moveaxis(slopes, 0, 1)
-        return RateTable(jnp.concatenate([both, derivatives], 1), self.lowest, self.highest)
+        coefficients = jnp.concatenate([function_and_slope, derivatives], 1)
+        return RateTable(coefficients, self.lowest, self.highest)
 
 
 @cache
@@ -108,6 +107,10 @@ def _chebyshev(num_nodes: int) -> tuple[np.ndarray, np.ndarray]:
 def _derivative_matrix(num_nodes: int) -> np.ndarray:
     """Matrix that takes the coefficients of a Chebyshev series to its derivative."""
     return np.pad(np.polynomial.chebyshev.chebder(np.eye(num_nodes)), ((0, 1), (0, 0)))
+
+
+_SCAN_POINTS = 16
+"""Temperatures at which the cooling rate is computed to determine the range of a `RateTable`."""
 
 
 def log_temperature_range(
