@@ -4,6 +4,7 @@ Units are the same as in `jaxgran.theory.averages`.
 """
 
 from math import pi, sqrt
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -15,23 +16,26 @@ from jaxgran.scene.reduced import ReducedRough
 TYPICAL_IMPACT = 2 * sqrt(2 / pi)
 """Mean normal speed of impacts, weighted by itself, in units of sqrt(2 T)."""
 
+MAX_STICKING = 1e6
+"""Bound of `coulomb_limit`, above which no sphere slides in double precision."""
+
 
 def mean_impulse(law: ReducedLaw, speed: Float[Array, "*points"]) -> Float[Array, "*points"]:
     """Return (1 + eps)/2 of the typical impact: the normal impulse over m times the normal speed.
 
     The cooling of sliding spheres of ice is then right within 2 %.
+
+    Args:
+        law: law of restitution in units of `Gas.impact_speed`.
+        speed: sqrt(T/T_0).
     """
     return (1 + law.restitution(TYPICAL_IMPACT * speed)) / 2
-
-
-MAX_STICKING = 1e6
-"""Bound of the friction over the slip, above which no sphere slides in double precision."""
 
 
 def coulomb_limit(
     surface: ReducedRough, eta: Array, impulse: Array, variance: Array
 ) -> Float[Array, "..."] | None:
-    """Return m of `slip_moments`, ``mu (1 + eps)/2 / (eta sqrt(V/S))``; None without friction.
+    """Return m of `SlipMoments`, ``mu (1 + eps)/2 / (eta sqrt(V/S))``; None without friction.
 
     Args:
         surface: in reduced units.
@@ -45,57 +49,94 @@ def coulomb_limit(
     return jnp.minimum(surface.friction * impulse / slip, MAX_STICKING)
 
 
-_STEEP = 5.0
+class SlipMoments(NamedTuple):
+    """Means over impacts of products of the slip u, the impulse J along it and the normal speed g.
+
+    u has d - 1 Gaussian components of variance 1, and g the density ``g exp(-g^2/2)``. Spheres
+    stick or slide: ``J = min(u, m g)``.
+
+    Attributes:
+        uJ, J2, u2J2, u3J: of u J, J^2, u^2 J^2 and u^3 J. With ``c = m/sqrt(1 + m^2)`` the first
+            two are ``c^2 + m arccot m`` and ``2 c^2`` in 3D, and ``c`` and ``2 c^2/(1 + c)`` in 2D.
+        J4, uJ3: of J^4 and u J^3.
+        g2uJ, g2J2: of g^2 u J and g^2 J^2.
+    """
+
+    uJ: Float[Array, "..."]
+    J2: Float[Array, "..."]
+    u2J2: Float[Array, "..."]
+    u3J: Float[Array, "..."]
+    J4: Float[Array, "..."]
+    uJ3: Float[Array, "..."]
+    g2uJ: Float[Array, "..."]
+    g2J2: Float[Array, "..."]
+
+
+_LARGE_M = 5.0
 """m above which `slip_moments` uses a series in 1/m^2."""
 
-_STEEP_SERIES = [2 * (-1) ** n * (n + 1) / (2 * n + 3) for n in range(9, -1, -1)]
+_LARGE_M_SERIES = [2 * (-1) ** n * (n + 1) / (2 * n + 3) for n in range(9, -1, -1)]
 """``m^2 (m arccot m - m^2/(1 + m^2))`` in powers of 1/m^2, the highest first."""
 
 
-def slip_moments(m: Float[Array, "..."] | None, d: int) -> list[Float[Array, "..."]]:
-    """Return means of a slip y and an impulse ``z = min(y, m x)`` at the normal speed x of impacts.
-
-    y has d - 1 Gaussian components of variance 1, and x the density ``x exp(-x^2/2)``.
+def slip_moments(m: Float[Array, "..."] | None, d: int) -> SlipMoments:
+    """Return the means of `SlipMoments`, each of the shape of m.
 
     Args:
-        m: any shape; None where all spheres stick, m = infinity.
+        m: Coulomb's limit of J over g, see `coulomb_limit`, any shape; None where all spheres
+            stick, m = infinity.
         d: dimension.
-
-    Returns:
-        The means of y z, z^2, y^2 z^2, y^3 z, z^4, y z^3, x^2 y z and x^2 z^2, each of the shape
-        of m. With ``c = m/sqrt(1 + m^2)`` the first two are ``c^2 + m arccot m`` and ``2 c^2`` in
-        3D, and ``c`` and ``2 c^2/(1 + c)`` in 2D.
     """
     c = jnp.ones(()) if m is None else m / jnp.sqrt(1 + m**2)
     if d == 2:
-        w = c**2 / (1 + c)
-        return [
-            c,
-            2 * w,
-            2 * (w + c**3),
-            2 * c + c**3,
-            4 * w**2 * (2 + c),
-            3 * c**3,
-            3 * c - c**3,
-            2 * w * (4 - c - c**2),
-        ]
-    x = c**2
-    g = jnp.ones(())
-    h = 2 / 3
+        half_J2 = c**2 / (1 + c)
+        return SlipMoments(
+            uJ=c,
+            J2=2 * half_J2,
+            u2J2=2 * (half_J2 + c**3),
+            u3J=2 * c + c**3,
+            J4=4 * half_J2**2 * (2 + c),
+            uJ3=3 * c**3,
+            g2uJ=3 * c - c**3,
+            g2J2=2 * half_J2 * (4 - c - c**2),
+        )
+    c2 = c**2
+    m_arccot = jnp.ones(())
+    # m^2 (m arccot m - c^2), whose terms nearly cancel where m is large.
+    difference = 2 / 3
     if m is not None:
-        g = m * jnp.arctan2(1.0, m)
-        series = jnp.polyval(jnp.asarray(_STEEP_SERIES, c.dtype), jnp.maximum(m, _STEEP) ** -2)
-        h = jnp.where(m < _STEEP, jnp.minimum(m, _STEEP) ** 2 * (g - x), series)
-    return [
-        g + x,
-        2 * x,
-        4 * x * (1 + x),
-        3 * (g + x) + 2 * x**2,
-        8 * x**2,
-        3 * h + 6 * x**2,
-        3 * (g + x) - 2 * x**2,
-        4 * x * (2 - x),
-    ]
+        m_arccot = m * jnp.arctan2(1.0, m)
+        series = jnp.polyval(jnp.asarray(_LARGE_M_SERIES, c.dtype), jnp.maximum(m, _LARGE_M) ** -2)
+        direct = jnp.minimum(m, _LARGE_M) ** 2 * (m_arccot - c2)
+        difference = jnp.where(m < _LARGE_M, direct, series)
+    return SlipMoments(
+        uJ=m_arccot + c2,
+        J2=2 * c2,
+        u2J2=4 * c2 * (1 + c2),
+        u3J=3 * (m_arccot + c2) + 2 * c2**2,
+        J4=8 * c2**2,
+        uJ3=3 * difference + 6 * c2**2,
+        g2uJ=3 * (m_arccot + c2) - 2 * c2**2,
+        g2J2=4 * c2 * (2 - c2),
+    )
+
+
+class RoughImpactMeans(NamedTuple):
+    """Mean changes of a sphere in an impact, times the impact rate over its value at T = 1.
+
+    Attributes:
+        v2_tangential, v2_normal: of v^2 by the tangential and by the normal part of the impulse.
+        slipping: the tangential impulse times the slip, over V.
+        s2: of s^2.
+        v2s2, s4: of v^2 s^2 and of s^4; None where v and s are taken to be Gaussian.
+    """
+
+    v2_tangential: Float[Array, "spheres n"]
+    v2_normal: Float[Array, "spheres n"]
+    slipping: Float[Array, "spheres n"]
+    s2: Float[Array, "spheres n"]
+    v2s2: Float[Array, "spheres n"] | None = None
+    s4: Float[Array, "spheres n"] | None = None
 
 
 def rough_impact_means(
@@ -109,8 +150,8 @@ def rough_impact_means(
     inertia: Float[Array, ""],
     d: int,
     gaussian: bool = False,
-) -> list[Float[Array, "spheres n"]]:
-    """Return mean changes of a sphere in an impact, times the impact rate over its value at T = 1.
+) -> RoughImpactMeans:
+    """Return mean changes of both spheres in an impact.
 
     The components of velocities v and of ``s = (sigma/2) w`` are Gaussian. Given the slip u and the
     normal speed g, the components along the slip are Gaussian, around ``(T/V) u`` for v and around
@@ -121,54 +162,54 @@ def rough_impact_means(
         a: variances of the components of s of both spheres.
         S: variance of the components of the relative velocity, the sum of the two T.
         V: variance of the components of the slip, the sum of S and of the two a.
-        m: see `slip_moments`, with ``m = mu (1 + eps)/2 / eta sqrt(S/V)``; None without a limit.
+        m: see `coulomb_limit`; None without a limit.
         impulse: (1 + eps)/2.
         eta: coefficient of `Rough`.
         inertia: q.
         d: dimension.
         gaussian: leave out the changes of v^2 s^2 and s^4.
-
-    Returns:
-        The changes of v^2 by the tangential and by the normal part, the impulse times the slip over
-        V, the changes of s^2, v^2 s^2 and s^4.
     """
-    N = NUM_SPIN_COMPONENTS[d]
+    num_spins = NUM_SPIN_COMPONENTS[d]
+    # Along the slip, s changes by r times the change of v.
     r = 1 / inertia
-    uJ, JJ, uuJJ, uuuJ, J4, uJ3, gguJ, ggJJ = slip_moments(m, d)
-    z = eta * r
+    slip = slip_moments(m, d)
+    eta_s = eta * r
     normal = impulse * (impulse * S - 2 * T)
-    of_v = eta * (eta * V * JJ - 2 * T * uJ)
-    of_s = z * (z * V * JJ - 2 * a * uJ)
+    of_v2 = eta * (eta * V * slip.J2 - 2 * T * slip.uJ)
+    of_s2 = eta_s * (eta_s * V * slip.J2 - 2 * a * slip.uJ)
     rate = jnp.sqrt(S / 2)
-    slipping = jnp.broadcast_to(eta * uJ, T.shape)
-    changes = [rate * x for x in (of_v, 2 * normal, slipping, of_s)]
+    slipping = jnp.broadcast_to(eta * slip.uJ, T.shape)
+    means = RoughImpactMeans(rate * of_v2, rate * (2 * normal), rate * slipping, rate * of_s2)
     if gaussian:
-        return changes
+        return means
     per_S = 1 / S
     per_V = 1 / V
-    both = T * a
-    rest = a + r * T
-    along_n = T * T * per_S
-    pushed = along_n + normal
-    of_vs = (
-        2 * N * a * normal
-        + eta * (2 * both * (((d + 1) * rest) * per_V - (N + r * d)) + 2 * r * a * along_n) * uJ
-        - 2 * eta * both * rest * per_V * uuuJ
-        + eta**2 * (N * a * V - (d - 1) * (a**2) - 4 * r * both) * JJ
-        + z**2 * (d * T * V - (d - 1) * T**2 - along_n * V) * JJ
-        + eta**2 * (rest**2 + 2 * r * both) * uuJJ
-        + z**2 * eta**2 * V**2 * J4
-        - 2 * z * eta**2 * V * rest * uJ3
-        + z * pushed * (z * V * ggJJ - 2 * a * gguJ)
+    Ta = T * a
+    a_and_rT = a + r * T
+    # Square of the normal velocity over g^2 of `SlipMoments`, as far as g determines it.
+    normal_v2 = T * T * per_S
+    normal_v2_after = normal_v2 + normal
+    of_v2s2 = (
+        2 * num_spins * a * normal
+        + eta
+        * (2 * Ta * (((d + 1) * a_and_rT) * per_V - (num_spins + r * d)) + 2 * r * a * normal_v2)
+        * slip.uJ
+        - 2 * eta * Ta * a_and_rT * per_V * slip.u3J
+        + eta**2 * (num_spins * a * V - (d - 1) * (a**2) - 4 * r * Ta) * slip.J2
+        + eta_s**2 * (d * T * V - (d - 1) * T**2 - normal_v2 * V) * slip.J2
+        + eta**2 * (a_and_rT**2 + 2 * r * Ta) * slip.u2J2
+        + eta_s**2 * eta**2 * V**2 * slip.J4
+        - 2 * eta_s * eta**2 * V * a_and_rT * slip.uJ3
+        + eta_s * normal_v2_after * (eta_s * V * slip.g2J2 - 2 * a * slip.g2uJ)
     )
-    spin = a * ((N + 2) * V - (d + 1) * a)
-    of_ss = (
-        -4 * z * a * per_V * (spin * uJ + a**2 * uuuJ)
-        + 2 * z**2 * (spin * JJ + 3 * a**2 * uuJJ)
-        + z**4 * V**2 * J4
-        - 4 * z**3 * a * V * uJ3
+    across = a * ((num_spins + 2) * V - (d + 1) * a)
+    of_s4 = (
+        -4 * eta_s * a * per_V * (across * slip.uJ + a**2 * slip.u3J)
+        + 2 * eta_s**2 * (across * slip.J2 + 3 * a**2 * slip.u2J2)
+        + eta_s**4 * V**2 * slip.J4
+        - 4 * eta_s**3 * a * V * slip.uJ3
     )
-    return [*changes, rate * of_vs, rate * of_ss]
+    return means._replace(v2s2=rate * of_v2s2, s4=rate * of_s4)
 
 
 def rough_energy_moments(
@@ -182,15 +223,15 @@ def rough_energy_moments(
 ) -> tuple[Float[Array, "2"], Float[Array, "2 2"]]:
     """Return moments of the energies that an impact of rough spheres adds, over m T and its square.
 
-    The energies are the translational one, ``e = -x/2 + z^2 - z g``, and the rotational one,
-    ``e' = z^2/q - z s``, with the loss x of the normal motion, the tangential velocities g of the
-    centres and s of the surfaces along the slip u = g + s, and the impulse z along it, the smaller
-    one of eta u and Coulomb's limit. Velocities are Gaussian: given u the means of g and s are
-    ``(S/V) u`` and ``(A/V) u``, with V = S + A.
+    The energies are the translational one, ``e = -x/2 + z^2 - z v``, and the rotational one,
+    ``e' = z^2/q - z s``. Here x is the loss of the normal motion; v and s are the relative
+    tangential velocities of the centres and of the surfaces about them, along the slip u = v + s;
+    z is the impulse along it, the smaller one of eta u and Coulomb's limit. Velocities are
+    Gaussian: given u the means of v and s are ``(S/V) u`` and ``(A/V) u``, with V = S + A.
 
     Args:
         losses: <x> and <x^2>, see `loss_moments`.
-        m: see `slip_moments`, with ``m = mu (1 + eps)/2 / eta sqrt(S/V)``; None without a limit.
+        m: see `coulomb_limit`; None without a limit.
         eta: coefficient of `Rough`.
         inertia: q.
         S: variance of the components of the relative velocity over T, 2 of two Maxwellian spheres.
@@ -200,21 +241,24 @@ def rough_energy_moments(
     Returns:
         <e> and <e'>; and the matrix <e^2>, <e e'>; <e e'>, <e'^2>.
     """
-    uJ, JJ, uuJJ, _, J4, uJ3, gguJ, ggJJ = slip_moments(m, d)
+    slip = slip_moments(m, d)
+    loss, loss_square = losses
     q = inertia
     V = S + A
-    means = -losses[0] / 2 + eta * (eta * V * JJ - S * uJ), eta * (eta / q * V * JJ - A * uJ)
-    fourth = eta**4 * V**2 * J4
-    third = eta**3 * V * uJ3
-    second = eta**2 * S * A * JJ
-    mixed = eta**2 * uuJJ
-    # With a constant eps, x and the slip would depend on each other by the speed alone.
-    normal = -losses[0] / 4
-    kick = eta**2 * V * ggJJ
-    square = fourth - 2 * S * third + S**2 * mixed + second
-    square = square + losses[1] / 4 + 2 * normal * (kick - eta * S * gguJ)
-    both = fourth / q - (A + S / q) * third + S * A * mixed - second
-    both = both + normal * (kick / q - eta * A * gguJ)
-    square_of_spin = fourth / q**2 - 2 * A / q * third + A**2 * mixed + second
+    mean = -loss / 2 + eta * (eta * V * slip.J2 - S * slip.uJ)
+    mean_of_spin = eta * (eta / q * V * slip.J2 - A * slip.uJ)
+    z4 = eta**4 * V**2 * slip.J4
+    z3u = eta**3 * V * slip.uJ3
+    # z^2 times the square of v or s: by their means at a slip, and by the deviations from these.
+    by_deviation = eta**2 * S * A * slip.J2
+    by_mean = eta**2 * slip.u2J2
+    # -x/2 over g^2, as for a constant eps: then only g correlates x with z.
+    normal = -loss / 4
+    z2g2 = eta**2 * V * slip.g2J2
+    square = z4 - 2 * S * z3u + S**2 * by_mean + by_deviation
+    square = square + loss_square / 4 + 2 * normal * (z2g2 - eta * S * slip.g2uJ)
+    both = z4 / q - (A + S / q) * z3u + S * A * by_mean - by_deviation
+    both = both + normal * (z2g2 / q - eta * A * slip.g2uJ)
+    square_of_spin = z4 / q**2 - 2 * A / q * z3u + A**2 * by_mean + by_deviation
     squares = jnp.stack([jnp.stack([square, both]), jnp.stack([both, square_of_spin])])
-    return jnp.stack(means), squares
+    return jnp.stack([mean, mean_of_spin]), squares
