@@ -52,8 +52,10 @@ def coulomb_limit(
 class SlipMoments(NamedTuple):
     """Means over impacts of products of the slip u, the impulse J along it and the normal speed g.
 
-    u has d - 1 Gaussian components of variance 1, and g the density ``g exp(-g^2/2)``. Spheres
-    stick or slide: ``J = min(u, m g)``.
+    The components of the slip have the variance V, those of the relative velocity the variance S.
+    u is in units of sqrt(V), J in units of eta sqrt(V), and g in units of sqrt(S): u has d - 1
+    Gaussian components of variance 1, and g the density ``g exp(-g^2/2)``. Spheres stick or slide,
+    with ``J = min(u, m g)``.
 
     Attributes:
         uJ, J2, u2J2, u3J: of u J, J^2, u^2 J^2 and u^3 J. With ``c = m/sqrt(1 + m^2)`` the first
@@ -102,8 +104,7 @@ def slip_moments(m: Float[Array, "..."] | None, d: int) -> SlipMoments:
         )
     c2 = c**2
     m_arccot = jnp.ones(())
-    # m^2 (m arccot m - c^2), whose terms nearly cancel where m is large.
-    difference = 2 / 3
+    difference = 2 / 3  # m^2 (m arccot m - c^2), whose terms nearly cancel where m is large
     if m is not None:
         m_arccot = m * jnp.arctan2(1.0, m)
         series = jnp.polyval(jnp.asarray(_LARGE_M_SERIES, c.dtype), jnp.maximum(m, _LARGE_M) ** -2)
