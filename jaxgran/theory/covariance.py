@@ -51,12 +51,11 @@ from jaxgran.theory.averages import (
     collision_rate,
     loss_moments,
     loss_nodes,
-    rough_energy_moments,
 )
 from jaxgran.theory.contact_noise import contact_covariance, contact_noise
 from jaxgran.theory.density import Density
-from jaxgran.theory.elements import coulomb_limit, mean_impulse
 from jaxgran.theory.moments import Spins
+from jaxgran.theory.rough_impacts import coulomb_limit, mean_impulse, rough_energy_moments
 from jaxgran.theory.sizes import (
     PairRates,
     drag_factors,

@@ -3,7 +3,8 @@
 Units are the same as in `jaxgran.theory.averages`; functions of a `Gas` use SI units.
 """
 
-from math import pi, sqrt
+from collections.abc import Callable
+from math import sqrt
 from typing import Any, NamedTuple
 
 import jax
@@ -13,10 +14,10 @@ from jaxtyping import Array, Float
 
 from jaxgran.scene.elements import MAX_WALL_IMPACT_RATIO, NUM_SPIN_COMPONENTS, wall_impact_ratio
 from jaxgran.scene.geometry import impact_average
-from jaxgran.scene.laws import ReducedLaw
 from jaxgran.scene.reduced import ReducedRough, ReducedScene, ReducedWalls
-from jaxgran.theory.averages import ElementBounds, collision_rate, rough_impact_means
+from jaxgran.theory.averages import collision_rate
 from jaxgran.theory.moments import Spins
+from jaxgran.theory.rough_impacts import coulomb_limit, mean_impulse, rough_impact_means
 from jaxgran.theory.sizes import drag_factors, equal_rates
 
 SUPPORTED = ("surface", "container", "drag", "drive", "diameter_sd")
@@ -28,13 +29,13 @@ class ElementRates(NamedTuple):
 
     Attributes:
         cooling: part of ``-d ln T/dt``.
-        spins: of `Spins` at constant T.
+        spins: rates of change of `Spins` at constant T.
         relaxation: part of the relaxation rate of the velocity autocorrelation function.
         sonine: part of ``da_2/dt``.
     """
 
     cooling: Any
-    spins: Spins = Spins(0.0, 0.0, 0.0)  # type: ignore[arg-type]
+    spins: Spins = Spins(0.0, 0.0, 0.0)
     relaxation: Any = 0.0
     sonine: Any = 0.0
 
@@ -61,7 +62,6 @@ def element_rates(
     spins = spins or Spins.gaussian(zero)
     parts = [ElementRates(zero)]
     surface = scene.surface
-    drag = scene.drag
     if surface is not None:
         impulse = mean_impulse(scene.law, speed)
         changes = rough_impact_rates(
@@ -71,67 +71,42 @@ def element_rates(
         rate = collision_rate(sonine if gaussian_spins else 0.0, dimension) * speed
         parts.append(jax.tree.map(lambda change: rate * change, changes))
     if scene.walls is not None:
-        on_walls = _wall_rates(scene.walls, surface, speed, spins, sonine, dimension)
-        parts.append(on_walls)
-    if drag is not None:
-        parts.append(ElementRates(2 * drag.rate, spins.damped(2 * drag.rotational_rate), drag.rate))
+        parts.append(_wall_rates(scene.walls, surface, speed, spins, sonine, dimension))
+    if scene.drag is not None:
+        drag = scene.drag
+        damping = spins.damped(2 * drag.rotational_rate)
+        parts.append(ElementRates(2 * drag.rate, damping, relaxation=drag.rate))
     if scene.drive is not None:
         heating = scene.drive / speed**2
-        heated = Spins(zero, -heating * spins.correlation, zero)
-        parts.append(ElementRates(-heating, heated, sonine=-2 * sonine * heating))
+        decorrelation = Spins(zero, -heating * spins.correlation, zero)
+        parts.append(ElementRates(-heating, decorrelation, sonine=-2 * sonine * heating))
     return jax.tree.map(lambda *rates: sum(rates), *parts)
 
 
-TYPICAL_IMPACT = 2 * sqrt(2 / pi)
-"""Mean normal speed of impacts, weighted by itself, in units of sqrt(2 T)."""
-
-
-def mean_impulse(law: ReducedLaw, speed: Float[Array, "*points"]) -> Float[Array, "*points"]:
-    """Return (1 + eps)/2 of the typical impact: the normal impulse over m times the normal speed.
-
-    The cooling of sliding spheres of ice is then right within 2 %.
-    """
-    return (1 + law.restitution(TYPICAL_IMPACT * speed)) / 2
-
-
-MAX_STICKING = 1e6
-"""Bound of the friction over the slip, above which no sphere slides in double precision."""
-
-_STEP = 0.04
-"""Steps of variances over S and V: second derivatives are then right to 1e-3."""
-
-A12 = 3.0
+A12_RATIO = 3.0
 """``a_12/(a_11 a_02)``: 2 to 3 in DSMC with a_02 from .3 to .9. Without a_12 spins of inelastic
 spheres (eps = .6, beta_t = -.3) have no cooling state."""
 
-_STENCIL = np.array(
+_RELATIVE_STEP = 0.04
+"""Step of T over S, and of a over V, of differences: second derivatives are right to 1e-3."""
+
+_DIFFERENCE_STEPS = np.array(
     [
         [0, 0, 0, 1, -1, 1, -1, 1, -1],
         [0, 1, -1, 1, -1, -1, 1, 0, 0],
+    ]
+)[:, None]
+"""Steps of T and of a to each of the points at which means are computed."""
+
+_DIFFERENCE_WEIGHTS = np.array(
+    [
         [-2, 0, 0, 0, 0, 0, 0, 1, 1],
         [0, 0, 0, 0.25, 0.25, -0.25, -0.25, 0, 0],
         [-2, 1, 1, 0, 0, 0, 0, 0, 0],
         [0, 0, 0, 0.5, -0.5, 0.5, -0.5, -1, 1],
     ]
 )[:, None]
-"""Steps in T and a, and weights of the differences d_TT, d_Ta, d_aa and d_Taa at these steps."""
-
-
-def coulomb_limit(
-    surface: ReducedRough, eta: Array, impulse: Array, variance: Array
-) -> Float[Array, "..."] | None:
-    """Return m of `slip_moments`, ``mu (1 + eps)/2 / (eta sqrt(V/S))``; None without friction.
-
-    Args:
-        surface: in reduced units.
-        eta: coefficient of `Rough`.
-        impulse: (1 + eps)/2, see `mean_impulse`.
-        variance: V/S, of a component of the slip over one of the relative velocity.
-    """
-    if surface.friction is None:
-        return None
-    slip = jnp.sqrt(variance) * jnp.maximum(eta, 1e-9)
-    return jnp.minimum(surface.friction * impulse / slip, MAX_STICKING)
+"""Weights of the means at these points in the central differences d_TT, d_Ta, d_aa and d_Taa."""
 
 
 def rough_impact_rates(
@@ -146,12 +121,14 @@ def rough_impact_rates(
 ) -> ElementRates:
     """Return the rates of change in impacts of rough spheres, per impact of a sphere.
 
-    The cooling is that by roughness. With the cumulants a_20 = a_2, a_11, a_02 and a_12 = 3 a_11
-    a_02 the distribution of a sphere is ``(1 + a_20 T^2/2 d_TT + a_11 T a d_Ta + a_02 a^2/2 d_aa +
-    a_12 T a^2/2 d_Taa) f`` with the Gaussian f of the variances T and a of the components of v and
-    s = (sigma/2) w, so that means are `rough_impact_means` and their derivatives, here by
-    differences. Products of cumulants of two spheres are left out, and directions of v and s are
-    taken to be independent.
+    The cooling is only its part by roughness. With the cumulants a_20 = a_2, a_11, a_02 and
+    a_12 = 3 a_11 a_02 the distribution of a sphere is
+
+        (1 + a_20 T^2/2 d_TT + a_11 T a d_Ta + a_02 a^2/2 d_aa + a_12 T a^2/2 d_Taa) f
+
+    with the Gaussian f of the variances T and a of the components of v and s = (sigma/2) w. Means
+    over it are thus `rough_impact_means` and their derivatives, here by differences. Products of
+    cumulants of two spheres are left out, and directions of v and s are taken to be independent.
 
     Spheres stick where eta times the slip is below ``mu (1 + eps)/2 g``.
 
@@ -173,38 +150,44 @@ def rough_impact_rates(
     a = spins.rotation / q
     correlation = spins.correlation / q
     kurtosis = spins.kurtosis / q**2
-    # The first sphere of a pair has the variances of a step of the stencil, the second one 1 and a.
-    stencil = jnp.asarray(_STENCIL[:, :, : 1 if gaussian else None], a.dtype)
-    step_T, step_a, of_TT, of_Ta, of_aa, of_Taa = stencil
-    size_T = 2 * _STEP
-    size_a = 2 * _STEP * (1 + a)
-    T1 = 1 + size_T * step_T
-    a1 = a + size_a * step_a
-    T = jnp.concatenate([T1, jnp.ones_like(T1)])
-    variance_of_spin = jnp.concatenate([a1, jnp.full_like(a1, a)])
-    S = 1 + T1
-    V = 1 + T1 + a + a1
+    # Only the first point, which has no step, enters the means over Gaussian v and s.
+    num_points = 1 if gaussian else _DIFFERENCE_STEPS.shape[-1]
+    step_T, step_a = jnp.asarray(_DIFFERENCE_STEPS[..., :num_points], a.dtype)
+    d_TT, d_Ta, d_aa, d_Taa = jnp.asarray(_DIFFERENCE_WEIGHTS[..., :num_points], a.dtype)
+    size_T = 2 * _RELATIVE_STEP
+    size_a = 2 * _RELATIVE_STEP * (1 + a)
+    # The first sphere of a pair has the variances of a point, the second one 1 and a.
+    T_first = 1 + size_T * step_T
+    a_first = a + size_a * step_a
+    T_of_both = jnp.concatenate([T_first, jnp.ones_like(T_first)])
+    a_of_both = jnp.concatenate([a_first, jnp.full_like(a_first, a)])
+    S = 1 + T_first
+    V = 1 + T_first + a + a_first
     m = coulomb_limit(surface, eta, impulse, V / S)
-    means = rough_impact_means(T, variance_of_spin, S, V, m, impulse, eta, q, d, gaussian)
+    means = rough_impact_means(T_of_both, a_of_both, S, V, m, impulse, eta, q, d, gaussian)
     # Sums over both spheres: each mean counts half.
-    weights = jnp.zeros_like(T1).at[0, 0].set(0.5)
+    weights = jnp.zeros_like(T_first).at[0, 0].set(0.5)
     if not gaussian:
-        weights += sonine / (2 * size_T**2) * of_TT
-        weights += correlation / (size_T * size_a) * of_Ta
-        weights += kurtosis / (2 * size_a**2) * of_aa
-        a12 = A12 * correlation * kurtosis * a / jnp.maximum(a**2, 1e-12)
-        weights += a12 / (2 * size_T * size_a**2) * of_Taa
-    v2, v2_by_normal, slipping, s2, *products = (jnp.sum(x * weights) for x in means)
-    rotation = s2 / num_spins
-    correlation_rate = jnp.zeros_like(s2)
-    kurtosis_rate = jnp.zeros_like(s2)
+        weights += sonine / (2 * size_T**2) * d_TT
+        weights += correlation / (size_T * size_a) * d_Ta
+        weights += kurtosis / (2 * size_a**2) * d_aa
+        a12 = A12_RATIO * correlation * kurtosis * a / jnp.maximum(a**2, 1e-12)
+        weights += a12 / (2 * size_T * size_a**2) * d_Taa
+    changes = jax.tree.map(lambda mean: jnp.sum(mean * weights), means)
+    rotation_rate = changes.s2 / num_spins
+    correlation_rate = jnp.zeros_like(rotation_rate)
+    kurtosis_rate = jnp.zeros_like(rotation_rate)
     if not gaussian:
-        v2s2, s4 = products
-        cooling = -(v2 + v2_by_normal) / d
-        correlation_rate = v2s2 / (d * num_spins) - rotation + (a + correlation) * cooling
-        kurtosis_rate = s4 / (num_spins * (num_spins + 2)) - 2 * a * rotation
-    changes = Spins(q * rotation, q * correlation_rate, q**2 * kurtosis_rate)
-    return ElementRates(-v2 / d, changes, slipping / d)
+        cooling = -(changes.v2_tangential + changes.v2_normal) / d
+        correlation_rate = (
+            changes.v2s2 / (d * num_spins) - rotation_rate + (a + correlation) * cooling
+        )
+        kurtosis_rate = changes.s4 / (num_spins * (num_spins + 2)) - 2 * a * rotation_rate
+    return ElementRates(
+        cooling=-changes.v2_tangential / d,
+        spins=Spins(q * rotation_rate, q * correlation_rate, q**2 * kurtosis_rate),
+        relaxation=changes.slipping / d,
+    )
 
 
 def _wall_rates(
@@ -226,38 +209,39 @@ def _wall_rates(
 
     The mean k-th power of the normal speed is ``1 + k (k - 2) a_2/8`` times its value in a
     Maxwellian gas. The relative velocity of two spheres has twice the variance of the velocity of
-    one, and a wall acts on one sphere only. So friction in an impact on a wall is that of two
-    impacts between spheres with half the eta. <dr^2> of a gas between walls is not computed.
+    one, and a wall acts on one sphere only. So friction in an impact on a wall has the effect of
+    two impacts between spheres with half the eta. <dr^2> of a gas between walls is not computed.
     """
 
     def axis_rates(frequency: Array) -> ElementRates:
-        def share(g: Array) -> Array:
+        def impact_ratio(g: Array) -> Array:
+            """Impacts at the normal speed g sqrt(T), over those in a homogeneous gas."""
             eps = walls.law.restitution(g * speed / sqrt(2))
             return wall_impact_ratio(eps, frequency / collision_rate(0.0, d), d)
 
-        def lost(g: Array) -> Array:
-            """Loss of v^2 over T in an impact at the normal speed g sqrt(T)."""
+        def v2_loss(g: Array) -> Array:
+            """Loss of v^2 over T in such an impact."""
             loss = walls.law.loss(g * speed / sqrt(2))
             return loss * (2 - loss) * g**2
 
-        def lost_fourth(g: Array) -> Array:
+        def v4_loss(g: Array) -> Array:
             """Loss of v^4 over T^2."""
-            return lost(g) * (2 * (g**2 + d - 1) - lost(g))
+            return v2_loss(g) * (2 * (g**2 + d - 1) - v2_loss(g))
 
-        squares, fourths = (
-            (1 + k * (k - 2) * sonine / 8)
-            * frequency
-            * impact_average(lambda g, of=of: share(g) * of(g), speed)
-            for k, of in ((3, lost), (5, lost_fourth))
-        )
-        cooling = squares / d
-        a2_rate = 2 * (1 + sonine) * cooling - fourths / (d * (d + 2))
+        def loss_rate(loss: Callable[[Array], Array], k: int) -> Array:
+            """Sum over the impacts of a unit of time of a loss in proportion to g^(k - 1)."""
+            mean = impact_average(lambda g: impact_ratio(g) * loss(g), speed)
+            return (1 + k * (k - 2) * sonine / 8) * frequency * mean
+
+        cooling = loss_rate(v2_loss, 3) / d
+        v4_rate = loss_rate(v4_loss, 5)
+        a2_rate = 2 * (1 + sonine) * cooling - v4_rate / (d * (d + 2))
         if surface is None or walls.surface is None:
             return ElementRates(cooling, sonine=a2_rate)
         eta = surface.eta_on_wall(walls.surface) / 2
         impulse = mean_impulse(walls.law, speed / sqrt(2))
         changes = rough_impact_rates(surface, eta, impulse, spins, sonine, d, gaussian=True)
-        impacts = 2 * frequency * impact_average(share, speed)
+        impacts = 2 * frequency * impact_average(impact_ratio, speed)
         changes = jax.tree.map(lambda change: impacts * change, changes)
         return changes._replace(cooling=cooling + changes.cooling, sonine=a2_rate)
 
@@ -269,52 +253,68 @@ MAX_SPEED_FACTOR = 1.2
 """Bound of ``1 + 3 a_2/8``, the factor of losses at walls."""
 
 
+class ElementBounds(NamedTuple):
+    """Upper bounds of the cooling and the heating by the elements of a scene.
+
+    Attributes:
+        cooling_over_speed: of the part of ``-d ln T/dt`` that grows with sqrt(T), over sqrt(T/T_0).
+        constant_cooling: of the part of ``-d ln T/dt`` that does not depend on T.
+        heating: of d(T/T_0)/dt by a drive; None where T never rises.
+        energy_gain: of T/T_0 gained from the spins of rough spheres or, where sizes differ, from
+            the large spheres; None where neither exists.
+    """
+
+    cooling_over_speed: Any = 0.0
+    constant_cooling: Any = 0.0
+    heating: Any = None
+    energy_gain: Any = None
+
+
 def element_bounds(scene: ReducedScene, dimension: int) -> ElementBounds:
     """Return upper bounds of the cooling and the heating by the elements of a scene.
 
     Spheres that do not rotate, and that stop at walls, cool fastest. The rotation heats at most by
     the initial energy of the spins.
-
-    Returns:
-        the part of ``-d ln T/dt`` over sqrt(T/T_0); its part that does not depend on T; d(T/T_0)/dt
-        by a drive, None where nothing heats; T/T_0 that a gas could gain from the spins, None for
-        smooth spheres.
     """
     d = dimension
     rate = collision_rate(0.0, d)
     surface = scene.surface
     walls = scene.walls
-    by_speed = 0.0
-    constant = 0.0
+    cooling_over_speed = 0.0
+    constant_cooling = 0.0
     heating = None
-    rotation = None
-
-    def friction(surface: ReducedRough, eta: Array, rate: Array) -> Array:
-        return rate * 2 * (d - 1) / d * (eta - eta**2)
-
+    energy_gain = None
     if surface is not None:
-        by_speed = by_speed + friction(surface, surface.eta, rate)
+        tangential = _max_tangential_cooling(surface.eta, rate, d)
+        cooling_over_speed = cooling_over_speed + tangential
         heating = jnp.zeros(())
-        rotation = NUM_SPIN_COMPONENTS[d] / d * surface.ratio
+        energy_gain = NUM_SPIN_COMPONENTS[d] / d * surface.ratio
     if walls is not None:
         frequency = walls.frequency / rate
-        share = wall_impact_ratio(jnp.zeros_like(frequency), frequency, d)
-        bound = 2 / d * MAX_SPEED_FACTOR * jnp.sum(walls.frequency * share)
+        ratio = wall_impact_ratio(jnp.zeros_like(frequency), frequency, d)
+        at_walls = 2 / d * MAX_SPEED_FACTOR * jnp.sum(walls.frequency * ratio)
         if surface is not None and walls.surface is not None:
-            most = 2 * MAX_WALL_IMPACT_RATIO * jnp.sum(walls.frequency)
-            bound += friction(surface, surface.eta_on_wall(walls.surface) / 2, most)
-        by_speed = by_speed + bound
+            wall_rate = 2 * MAX_WALL_IMPACT_RATIO * jnp.sum(walls.frequency)
+            eta = surface.eta_on_wall(walls.surface) / 2
+            at_walls = at_walls + _max_tangential_cooling(eta, wall_rate, d)
+        cooling_over_speed = cooling_over_speed + at_walls
     if scene.drag is not None:
-        constant = 2 * scene.drag.rate
+        constant_cooling = 2 * scene.drag.rate
     if scene.sizes is not None:
         # Impacts cool at most twice as fast, and small spheres have at most all of the energy.
         one = jnp.ones_like(scene.sizes.spread)
-        by_speed = by_speed - equal_rates(scene.law, one, 0.0, d)
+        cooling_over_speed = cooling_over_speed - equal_rates(scene.law, one, 0.0, d)
         small, large = scene.sizes.masses
         heating = jnp.zeros(())
-        rotation = (large - small) / (2 * small)
+        energy_gain = (large - small) / (2 * small)
         if scene.drag is not None:
-            constant = constant * drag_factors(scene.sizes)[0]
+            drag_factor_of_small, _ = drag_factors(scene.sizes)
+            constant_cooling = constant_cooling * drag_factor_of_small
     if scene.drive is not None:
         heating = scene.drive
-    return by_speed, constant, heating, rotation
+    return ElementBounds(cooling_over_speed, constant_cooling, heating, energy_gain)
+
+
+def _max_tangential_cooling(eta: Array, rate: Array, d: int) -> Array:
+    """Bound of ``-d ln T/dt`` by the tangential impulses, of spheres without spin that stick."""
+    return rate * 2 * (d - 1) / d * (eta - eta**2)

@@ -22,14 +22,13 @@ from jaxgran.scene.laws import C1
 from jaxgran.scene.reduced import ReducedScene
 from jaxgran.theory.averages import (
     TERMS,
-    RateTable,
     collision_rate,
     impact_moments,
-    log_temperature_range,
 )
 from jaxgran.theory.density import Density
 from jaxgran.theory.elements import element_bounds, element_rates
 from jaxgran.theory.moments import Moments, Spins
+from jaxgran.theory.rate_table import RateTable, log_temperature_range
 from jaxgran.theory.sizes import (
     drag_factors,
     equal_rates,
@@ -107,8 +106,9 @@ class Equations(NamedTuple):
         averages = partial(
             impact_moments, law, dimension=d, order=self.order, relaxation=self.spreading
         )
-        ends = log_temperature_range(law, duration, d, element_bounds(scene[0], d))
-        return RateTable.from_function(averages, *ends, law.num_nodes)
+        bounds = element_bounds(scene[0], d)
+        lowest, highest = log_temperature_range(law, duration, d, bounds)
+        return RateTable.from_function(averages, lowest, highest, law.num_nodes)
 
     def derivative(
         self,

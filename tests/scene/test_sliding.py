@@ -3,14 +3,10 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import quad
-from scipy.special import gamma
 
 import jaxgran
-from jaxgran.theory.averages import slip_moments
 from tests.beads import hard_gas, theory_curve, without
 from tests.fitting.curves import synthetic
 
@@ -34,26 +30,6 @@ def test_large_friction_is_no_limit(model, limits):
         each = [np.asarray(getattr(curve, name)) for curve in stuck]
         np.testing.assert_allclose(each[-1], each[0], rtol=1e-13)  # two programs
         assert np.all(np.abs(np.asarray(getattr(slid, name)) / each[0] - 1) > 1e-3)
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("m", [0.03, 0.7, 4.9, 40.0])
-def test_slip_moments_are_averages_over_slips_and_normal_speeds(dimension, m):
-    def mean(power_y, power_z, power_x):
-        def integrand(angle):
-            x, y = np.sin(angle), np.cos(angle)
-            z = min(y, m * x)
-            return y ** (power_y + dimension - 2) * z**power_z * x ** (power_x + 1)
-
-        power = power_y + power_z + power_x + dimension
-        radial = 2 ** ((power - 1) / 2) * gamma((power + 1) / 2)
-        norm = 1 if dimension == 3 else np.sqrt(2 / np.pi)
-        return norm * radial * quad(integrand, 0, np.pi / 2, points=[np.arctan(1 / m)])[0]
-
-    powers = [(1, 1, 0), (0, 2, 0), (2, 2, 0), (3, 1, 0), (0, 4, 0), (1, 3, 0), (1, 1, 2)]
-    powers.append((0, 2, 2))
-    expected = [mean(*x) for x in powers]
-    np.testing.assert_allclose(slip_moments(jnp.asarray(m), dimension), expected, rtol=1e-10)
 
 
 @pytest.mark.slow
