@@ -31,7 +31,7 @@ def test_few_spheres_still_have_some_impacts_in_each_window():
 
 def test_the_longest_window_follows_one_with_few_impacts():
     rng = np.random.default_rng(0)
-    for mean in (MIN_IMPACTS, 40, 1000):
+    for mean in (float(MIN_IMPACTS), 40.0, 1000.0):
         fewest = np.quantile(rng.poisson(mean, 10**5), 0.023)  # two standard deviations
         after = next_length(int(2 * fewest), share=2 * mean / 1000)
         np.testing.assert_allclose(after, longest_window(mean), rtol=0.05)
