@@ -19,7 +19,7 @@ class NotStorable(ValueError):
 def to_json(value: Any) -> Any:
     """Return a tree of objects as JSON takes it, of which `from_json` makes equal objects.
 
-    Single numbers and booleans of NumPy come back as those of Python.
+    Single numbers and booleans of NumPy come back as numbers and booleans of Python.
 
     Raises:
         NotStorable: for an object that is not of this package, an array, a number or a text, and
@@ -29,7 +29,7 @@ def to_json(value: Any) -> Any:
     >>> from_json(to_json((1.5, float("inf"), {"a": np.arange(2)})))
     (1.5, inf, {'a': array([0, 1])})
     """
-    # Numbers of NumPy come before those of Python, since np.float64 is a float, and named tuples
+    # NumPy's numbers come before Python's, since np.float64 is a float, and named tuples
     # before tuples.
     if isinstance(value, np.generic):
         return to_json(value.item())

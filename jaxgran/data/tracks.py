@@ -197,7 +197,7 @@ def _check_left_out(steps: list[Step], header: dict[str, str], remarks: _Remarks
     total = number + sum(len(step.ids) for step in steps)
     if not number:
         return
-    left_out = f"{number} of {total} displacements left out as those of wrong identities"
+    left_out = f"{number} of {total} displacements left out because of wrong identities"
     remarks.notes.append(left_out)
     if too_long > 1 + MAX_TAIL * CHANCE * len(steps) or exchanged > MAX_SWAPPED * total:
         remarks.questions.append(

@@ -288,7 +288,7 @@ def tracks(*, wrong=0.0, gaps=0.0, noise=0.0, wrapped=False, swaps=(), d=3):
     return np.concatenate(rows, axis=1), T, side
 
 
-OUT = "displacements left out as those of wrong identities"
+OUT = "displacements left out because of wrong identities"
 RATE = "velocities change .* times as fast as impacts"
 FREE = {"N": 400}
 GAS = FREE | {"eta": 0.04, "diameter": 0.003}

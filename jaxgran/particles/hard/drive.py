@@ -19,7 +19,7 @@ from jaxgran.particles.spheres import SphereState, by_replica, temperature
 from jaxgran.scene.reduced import ReducedScene, SphereScene
 
 DRIVE_STREAM = 3
-"""Stream of the random numbers of a drive, beside those of the start."""
+"""Stream of a drive's random numbers, apart from the stream of the start."""
 
 
 def initial_kick_key(key: PRNGKeyArray) -> UInt32[Array, "3"]:

@@ -61,7 +61,7 @@ def select_members(
     members, is_used, num_members = rows_where(is_member, max_members)
     members = jnp.where(is_used, members, n)
     slots = jnp.arange(max_members, dtype=jnp.int32)
-    # Where members are missing, their slot is that of another one: the caller rejects the block.
+    # Where members are missing, their slot belongs to another one: the caller rejects the block.
     slot = jnp.zeros(n, jnp.int32).at[members].set(slots, mode="drop")
     first, second = jnp.where(real[None], slot[ends], 0)
     return Selection(
