@@ -23,7 +23,7 @@ from jaxtyping import Float
 from jaxgran.fitting.goodness import SIGNIFICANCE, goodness
 from jaxgran.fitting.kinds import Kind, kinds_of
 from jaxgran.fitting.parameters import magnitude_of, with_values
-from jaxgran.fitting.problem import Problem, unknown_of
+from jaxgran.fitting.problem import Problem, build_unknown
 from jaxgran.fitting.profiles import ALLOWED, ALLOWED_OVER_ALL, Trial, profile_of, trial_of
 from jaxgran.fitting.rows import WHITE
 from jaxgran.fitting.search import Minimum
@@ -318,13 +318,13 @@ def _fit_beside(stage: _Stage, effect: Kind) -> _Stage | None:
     # Drop tests have the law of impacts, too: all measurements share its parameter.
     for label in labels[:1] if effect.changes_law else labels:
         place = None if effect.changes_law else label
-        unknown = unknown_of(effect.varied, place, gases[label], problem.curves)
+        unknown = build_unknown(effect.varied, place, gases[label], problem.curves)
         unknowns.append(unknown)
         start.append(unknown.domain.to_free(guesses[label]) / unknown.unit)
     both = replace(
         effect.with_wider_rate_errors(problem, at_best.amplitude),
         unknowns=(*problem.unknowns, *unknowns),
-        fixed=problem.fixed_with(fixed),
+        fixed=problem.extend_fixed(fixed),
     )
     origin = np.append(stage.origin, start)
     base = trial_of(both, 0.0, np.append(at_best.flat, start), origin)
@@ -378,7 +378,7 @@ class _Summary(NamedTuple):
             amplitude=self.base.amplitude,
             allowed=allowed.amplitudes,
             improvement=0.0,
-            estimate=self.problem.estimates(self.base.flat),
+            estimate=self.problem.to_estimates(self.base.flat),
             low=allowed.low,
             high=allowed.high,
             preferred=False,
@@ -408,7 +408,7 @@ class _Summary(NamedTuple):
             amplitude=best.amplitude,
             allowed=(best.amplitude, best.amplitude),
             improvement=improvement,
-            estimate=self.problem.estimates(best.flat),
+            estimate=self.problem.to_estimates(best.flat),
             low=beside.low,
             high=beside.high,
             preferred=bool(improvement - beside.improvement > self.significant),
@@ -467,17 +467,17 @@ class _Summary(NamedTuple):
         """Whether the unconstrained scale of each free parameter is a logarithm."""
         domains = [u.domain for u in self.problem.unknowns]
         is_positive = [np.isfinite(x.low) and not np.isfinite(x.high) for x in domains]
-        return self.problem.per_element(is_positive)[: self.problem.num_free]
+        return self.problem.repeat_per_element(is_positive)[: self.problem.num_free]
 
     def _to_si(self, free: np.ndarray, best: Trial) -> np.ndarray:
         with np.errstate(over="ignore"):
-            return self.problem.estimates(np.append(free, best.flat[free.size :]))
+            return self.problem.to_estimates(np.append(free, best.flat[free.size :]))
 
 
 def _constant_restitution(problem: Problem, trial: Trial) -> float:
     """Return eps of a trial in which it is constant."""
     m = problem.curves[0]
-    values = problem.values(trial.flat)[m.label]
+    values = problem.unflatten(trial.flat)[m.label]
     known = {name: x for name, x in values.items() if name in m.gas.domains}
     gas = with_values(m.gas, known | {"exponent": 0.0})
     return float(gas.restitution(VARIANT_SPEED))

@@ -41,7 +41,7 @@ def assemble_fit(
     problem, best, _ = solution
     found = solution.evaluate()
     covariance = inverse(found.information)
-    values = problem.values(best.flat)
+    values = problem.unflatten(best.flat)
     gases = {m.label: _fitted_gas(m.scene, values[m.label]) for m in problem.measurements}
     curves: dict[str, CoolingCurve | None] = dict.fromkeys(gases)
     for m in problem.curves:
@@ -54,7 +54,7 @@ def assemble_fit(
         measurements=request.measurements,
         gas=gases[""] if is_single else gases,
         curve=curves[""] if is_single else curves,
-        estimate=problem.estimates(best.flat),
+        estimate=problem.to_estimates(best.flat),
         covariances=_covariances(solution, covariance),
         ranges=parameter_ranges(problem, explanations),
         alternatives=() if explanations is None else explanations.alternatives,
@@ -63,7 +63,7 @@ def assemble_fit(
         residuals=_residuals(problem, found),
         scatter=_scatter(problem, best.flat, covariance),
         errors_of_T={
-            u.label or "": float(error) for u, error in problem.parts(best.flat) if u.name == WHITE
+            u.label or "": float(error) for u, error in problem.split(best.flat) if u.name == WHITE
         },
         scales={m.label: describe_gas(gases[m.label], m) for m in problem.curves},
         start_time={m.label: float(values[m.label].get(START_TIME, 0.0)) for m in problem.curves},
@@ -102,7 +102,7 @@ def _covariances(solution: Solution, covariance: np.ndarray) -> dict[str, np.nda
     """
     problem = solution.problem
     p = problem.num_free
-    to_si = problem.slopes(solution.best.flat)[:, None] * covariance
+    to_si = problem.compute_slopes(solution.best.flat)[:, None] * covariance
     parts = information_by_source(solution)
     covariances = {name: (to_si @ part @ to_si.T)[:p, :p] for name, part in parts.items()}
     of_minima = covariance_of_minima(solution, covariance)
@@ -145,7 +145,7 @@ def _scatter(
     errors = np.sqrt(np.diag(covariance))
     return {
         e.label or "": (float(np.exp(flat[e.place])), float(errors[e.place]))
-        for e in problem.elements(flat)
+        for e in problem.list_elements(flat)
         if e.name == SCATTER
     }
 

@@ -131,7 +131,8 @@ def covariance_of_minima(solution: Solution, covariance: np.ndarray) -> np.ndarr
     for m in sorted(minima, key=lambda minimum: minimum.value):
         if min(_distance(m, other, error) for other in kept) > 1:
             kept.append(m)
-    distance = np.stack([problem.estimates(m.flat) - problem.estimates(best.flat) for m in kept])
+    estimate = problem.to_estimates(best.flat)
+    distance = np.stack([problem.to_estimates(m.flat) - estimate for m in kept])
     weights = np.exp([(best.value - m.value) / 2 for m in kept])
     return np.einsum("k,ki,kj->ij", weights / np.sum(weights), distance, distance)
 
@@ -148,7 +149,7 @@ def equally_good_minima(solution: Solution, covariance: np.ndarray) -> np.ndarra
     for m in minima:
         is_deep = m.value < best.value + DEGENERATE
         is_apart = _distance(m, best, error) > DEGENERATE**0.5
-        estimate = problem.estimates(m.flat)
+        estimate = problem.to_estimates(m.flat)
         is_known = any(np.allclose(estimate, other, rtol=1e-3) for other in estimates)
         if is_deep and is_apart and not is_known:
             estimates.append(estimate)
@@ -196,7 +197,7 @@ def undetermined(problem: Problem, found: Evaluation) -> tuple[str, ...]:
     size = np.maximum(np.linalg.norm(sensitivity, axis=0), np.finfo(float).tiny)
     _, singular, axes = np.linalg.svd(sensitivity / size, full_matrices=False)
     is_weak |= _take_part(axes[singular <= problem.model.derivative_accuracy * singular[0]])
-    titles = problem.per_element([u.title for u in problem.unknowns])[:p]
+    titles = problem.repeat_per_element([u.title for u in problem.unknowns])[:p]
     left_out = _exempt_parameters(problem.measurements[0].scene.law)
     return tuple(dict.fromkeys(str(x) for x in titles[is_weak] if x not in left_out))
 

@@ -296,7 +296,7 @@ def _is_open(kind: Kind, problem: Problem, rows: CurveRows) -> bool:
 
 
 def _fitted_curves(problem: Problem, flat: np.ndarray) -> dict[str, FittedCurve]:
-    values = problem.values(flat)
+    values = problem.unflatten(flat)
     computed = problem.evaluate(flat).curves
     curves = {}
     for m in problem.curves:

@@ -52,8 +52,8 @@ def describe_outliers(problem: Problem, first: np.ndarray, max_steps: int) -> It
         time = times[value.label][value.time]
         places.append(f"{prefix_of(value.label)}t = {time:.3g} s (row {value.time + 1})")
     symbol = symbol_of(problem.unknowns[0].name)
-    estimate = rest.estimates(end.flat)[0]
-    error = np.sqrt(inverse(found.information)[0, 0]) * rest.slopes(end.flat)[0]
+    estimate = rest.to_estimates(end.flat)[0]
+    error = np.sqrt(inverse(found.information)[0, 0]) * rest.compute_slopes(end.flat)[0]
     yield (
         f"far outliers at {', '.join(places)}: check them and their error bars; without them "
         f"{symbol} is {estimate:.3g} +- {error:.2g}"

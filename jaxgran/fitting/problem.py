@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -108,9 +109,7 @@ class Problem:
         curves = [m for m in measurements if isinstance(m, CurveRows)]
         gas = measurements[0].gas
 
-        def unknown(name: str, label: str | None, gas: Gas) -> Unknown:
-            return unknown_of(name, label, gas, curves)
-
+        unknown = partial(build_unknown, curves=curves)
         unknowns = [unknown(name, None, gas) for name in free]
         unknowns += [unknown(name, m.label, m.gas) for name in separate for m in curves]
         num_free = sum(u.size for u in unknowns)
@@ -143,16 +142,16 @@ class Problem:
             begin = end
         return places
 
-    def fixed_with(self, values: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    def extend_fixed(self, values: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
         """Return the fixed values with further ones, by label and name."""
         labels = {*self.fixed, *values}
         return {label: self.fixed.get(label, {}) | values.get(label, {}) for label in labels}
 
-    def holding(self, name: str) -> tuple["Problem", np.ndarray]:
-        """Return the problem with the unknowns of a name held at 0, and which ones are left."""
+    def hold_at_zero(self, name: str) -> tuple["Problem", np.ndarray]:
+        """Return the problem with the unknowns of a name held at 0, and which elements are left."""
         unknowns = tuple(u for u in self.unknowns if u.name != name)
         fixed = {m.label: self.fixed.get(m.label, {}) | {name: 0.0} for m in self.measurements}
-        names = self.per_element([u.name for u in self.unknowns])
+        names = self.repeat_per_element([u.name for u in self.unknowns])
         return replace(self, unknowns=unknowns, fixed=fixed), names != name
 
     def check_points(self) -> None:
@@ -168,7 +167,7 @@ class Problem:
         """Raise ValueError if a search through a logarithm would begin at minus infinity."""
         at_end = [
             f"{unknown.title} = {value}"
-            for unknown, value in self.parts(flat)
+            for unknown, value in self.split(flat)
             if not np.all(np.isfinite(unknown.domain.to_free(value)))
         ]
         if at_end:
@@ -177,20 +176,20 @@ class Problem:
                 "start, a value inside it"
             )
 
-    def flat(self, values: dict[str, dict[str, Any]]) -> np.ndarray:
+    def flatten(self, values: dict[str, dict[str, Any]]) -> np.ndarray:
         """Return SI values, by label and name, in their unconstrained scale, in one array.
 
         They are the values of all parameters of the gases, and of t0 where it is an unknown;
         nuisance parameters are 0.
         """
-        parts = [np.zeros(0)]
+        parts = []
         for u in self.unknowns:
             label = self.measurements[0].label if u.label is None else u.label
             value = np.asarray(values[label].get(u.name, 0.0), float)
             parts.append(np.ravel(u.domain.to_free(value) / u.unit))
-        return np.concatenate(parts)
+        return _concatenated(parts)
 
-    def parts(self, flat: Any) -> list[tuple[Unknown, Any]]:
+    def split(self, flat: Any) -> list[tuple[Unknown, Any]]:
         """Return each unknown with its SI value."""
         pairs = []
         begin = 0
@@ -200,33 +199,33 @@ class Problem:
             pairs.append((u, u.domain.from_free(free * u.unit)))
         return pairs
 
-    def estimates(self, flat: np.ndarray) -> np.ndarray:
+    def to_estimates(self, flat: np.ndarray) -> np.ndarray:
         """Return SI values of the free parameters in one array."""
-        values = [np.ravel(value) for _, value in self.parts(flat)]
-        return np.concatenate([flat[:0], *values])[: self.num_free]
+        values = [np.ravel(value) for _, value in self.split(flat)]
+        return _concatenated(values)[: self.num_free]
 
-    def slopes(self, flat: np.ndarray) -> np.ndarray:
+    def compute_slopes(self, flat: np.ndarray) -> np.ndarray:
         """Return the derivative of each SI value in its unconstrained parameter."""
-        slopes = [np.ravel(u.domain.slope(value)) * u.unit for u, value in self.parts(flat)]
-        return np.concatenate([flat[:0], *slopes])
+        slopes = [np.ravel(u.domain.slope(value)) * u.unit for u, value in self.split(flat)]
+        return _concatenated(slopes)
 
-    def per_element(self, values: Sequence[Any]) -> np.ndarray:
+    def repeat_per_element(self, values: Sequence[Any]) -> np.ndarray:
         """Return one value for each unknown, repeated for each of its elements."""
         return np.repeat(values, [u.size for u in self.unknowns])
 
-    def values(self, flat: Any) -> dict[str, dict[str, Any]]:
+    def unflatten(self, flat: Any) -> dict[str, dict[str, Any]]:
         """Return SI values of all parameters that are varied, by label and name."""
         values = {m.label: dict(self.fixed.get(m.label, {})) for m in self.measurements}
-        for u, value in self.parts(flat):
+        for u, value in self.split(flat):
             labels = values.keys() if u.label is None else [u.label]
             for label in labels:
                 values[label][u.name] = value
         return values
 
-    def elements(self, flat: np.ndarray) -> list[Element]:
+    def list_elements(self, flat: np.ndarray) -> list[Element]:
         """Return each number of the unknowns, with its derivative in the unconstrained scale."""
         places = [(u, number) for u in self.unknowns for number in range(u.size)]
-        slopes = self.slopes(flat)
+        slopes = self.compute_slopes(flat)
         return [
             Element(u.name, u.label, number, place, float(slopes[place]))
             for place, (u, number) in enumerate(places)
@@ -249,8 +248,8 @@ class Problem:
         return kept[key]
 
     def _evaluate(self, flat: np.ndarray, sources: dict[str, float]) -> Evaluation:
-        values = self.values(flat)
-        elements = self.elements(flat)
+        values = self.unflatten(flat)
+        elements = self.list_elements(flat)
         impacts = [
             (m, _compared_impacts(m, values[m.label]))
             for m in self.measurements
@@ -294,8 +293,8 @@ class Problem:
 
     def compile_innovations(self, flat: np.ndarray) -> None:
         """Compile what an evaluation needs apart from the curves, whatever these are."""
-        values = self.values(flat)
-        elements = self.elements(flat)
+        values = self.unflatten(flat)
+        elements = self.list_elements(flat)
         for m in self.curves:
             curve = predicted_curve(
                 m,
@@ -308,7 +307,12 @@ class Problem:
             Comparison(curve).residuals(len(elements))
 
 
-def unknown_of(name: str, label: str | None, gas: Gas, curves: Iterable[CurveRows]) -> Unknown:
+def _concatenated(arrays: list[np.ndarray]) -> np.ndarray:
+    """Return arrays as one, which is empty if there are none."""
+    return np.concatenate(arrays) if arrays else np.zeros(0)
+
+
+def build_unknown(name: str, label: str | None, gas: Gas, curves: Iterable[CurveRows]) -> Unknown:
     """Return a parameter, of the measurement with a label or of all, as an unknown.
 
     Args:

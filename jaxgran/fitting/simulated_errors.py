@@ -100,7 +100,7 @@ class SimulatedEstimate(NamedTuple):
     @property
     def scale(self) -> Float[np.ndarray, "p 1"]:
         """Derivatives of the parameters, SI, in the unconstrained ones."""
-        return self.sims.problem.slopes(self.search.average.flat)[:, None]
+        return self.sims.problem.compute_slopes(self.search.average.flat)[:, None]
 
 
 def covariances_of(

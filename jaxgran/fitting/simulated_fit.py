@@ -85,7 +85,7 @@ def fit_through_simulations(
     # Nuisance parameters belong to fits by kinetic theory.
     problem = replace(problem, unknowns=problem.unknowns[: len(request.names)])
     problem.check_points()
-    first = problem.flat({"": guess.parameters})
+    first = problem.flatten({"": guess.parameters})
     problem.check_start(first)
     (known_to_theory,) = of_theory.measurements.values()
     theory, _ = curve_rows("", known_to_theory, KineticTheory(), fits_T_0=fits_T_0, fits_t0=True)
@@ -143,14 +143,14 @@ def _result(
     flat = search.average.flat
     p = flat.size
     expansion = expand(sims, search)
-    gas = with_parameters(sims.rows.scene, as_jax_arrays(as_floats(problem.values(flat)[""])))
+    gas = with_parameters(sims.rows.scene, as_jax_arrays(as_floats(problem.unflatten(flat)[""])))
     estimate = SimulatedEstimate(sims, search, expansion, gas)
     bias = derivative_bias(estimate)
     priors = request.priors.get("", {})
     covariances = covariances_of(estimate, priors, bias)
     # The range, by kinetic theory, knows all other parts.
     further = [covariances[x] for x in (*priors, SLOPE) if x in covariances]
-    scale = problem.slopes(flat)
+    scale = problem.compute_slopes(flat)
     noise = sum(further, np.zeros((p, p))) / np.outer(scale, scale)
     if p > MAX_LINEARISED:
         covariances = {name: np.full_like(part, np.nan) for name, part in covariances.items()}
@@ -177,7 +177,7 @@ def _result(
         measurements=request.measurements,
         gas=gas,
         curve=search.curve,
-        estimate=problem.estimates(flat),
+        estimate=problem.to_estimates(flat),
         covariances=covariances,
         ranges=parameter_ranges(problem, explanations),
         alternatives=() if explanations is None else explanations.alternatives,
@@ -247,7 +247,7 @@ def _explanations(
         simulation=of_particles.simulation,
         rate_error=of_particles.rate_error,
     )
-    values = problem.values(start)[""]
+    values = problem.unflatten(start)[""]
     predicted = predicted_curve(rows, problem.model.simplified_for(rows.scene), values, [])
     compared = predicted.prediction.compared[predicted.place]
     offset = np.where(rows.used > 0, model_values.reshape(2, -1).T - compared, 0.0)

@@ -134,7 +134,7 @@ class Simulations:
 
     def gas_at(self, flat: Any) -> Gas:
         """Return the gas at some parameters, which may be traced."""
-        return with_parameters(self.rows.scene, self.problem.values(flat)[""])
+        return with_parameters(self.rows.scene, self.problem.unflatten(flat)[""])
 
     def curve_at(self, flat: Any, stream: int) -> CoolingCurve:
         """Return the curve of a simulation; each has another stream of random numbers."""
@@ -187,7 +187,7 @@ class Simulations:
 
     def compare_with_theory(self, flat: np.ndarray, rows: CurveRows) -> Comparison:
         """Compare kinetic theory with the measured rows."""
-        values = self.problem.values(flat)[""]
+        values = self.problem.unflatten(flat)[""]
         known = {name: x for name, x in values.items() if name in rows.gas.domains}
         return Comparison(predicted_curve(rows, KineticTheory(), known, []))
 
@@ -365,7 +365,8 @@ def by_descent(
         return Loss(float(value), gradient)
 
     used = int(np.sum(sims.rows.used))
-    course = descent.descend(at, first, max_simulations, used, sims.problem.estimates, noisy=True)
+    to_estimates = sims.problem.to_estimates
+    course = descent.descend(at, first, max_simulations, used, to_estimates, noisy=True)
     flats = course.flats
     averaged = (len(flats) + 1) // 2
     flat = np.mean(flats[-averaged:], axis=0)
