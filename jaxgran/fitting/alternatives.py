@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from jaxgran.fitting.goodness import SIGNIFICANCE, goodness
 from jaxgran.fitting.kinds import Kind, kinds_of
-from jaxgran.fitting.parameters import magnitude_of, with_values
+from jaxgran.fitting.parameters import SHARED, magnitude_of, with_values
 from jaxgran.fitting.problem import Problem, build_unknown
 from jaxgran.fitting.profiles import ALLOWED, ALLOWED_OVER_ALL, Trial, profile_of, trial_of
 from jaxgran.fitting.rows import WHITE
@@ -317,8 +317,8 @@ def _fit_beside(stage: _Stage, effect: Kind) -> _Stage | None:
     start = []
     # Drop tests have the law of impacts, too: all measurements share its parameter.
     for label in labels[:1] if effect.changes_law else labels:
-        place = None if effect.changes_law else label
-        unknown = build_unknown(effect.varied, place, gases[label], problem.curves)
+        owner = SHARED if effect.changes_law else label
+        unknown = build_unknown(effect.varied, owner, gases[label], problem.curves)
         unknowns.append(unknown)
         start.append(unknown.domain.to_free(guesses[label]) / unknown.unit)
     both = replace(

@@ -63,7 +63,7 @@ def assemble_fit(
         residuals=_residuals(problem, found),
         scatter=_scatter(problem, best.flat, covariance),
         errors_of_T={
-            u.label or "": float(error) for u, error in problem.split(best.flat) if u.name == WHITE
+            u.label: float(error) for u, error in problem.split(best.flat) if u.name == WHITE
         },
         scales={m.label: describe_gas(gases[m.label], m) for m in problem.curves},
         start_time={m.label: float(values[m.label].get(START_TIME, 0.0)) for m in problem.curves},
@@ -126,7 +126,7 @@ def _residuals(problem: Problem, found: Evaluation) -> dict[str, dict[str, np.nd
     residuals: dict[str, dict[str, np.ndarray]] = {m.label: {} for m in problem.measurements}
     curves = {m.label: m for m in problem.curves}
     for row in found.rows:
-        if row.is_prior or row.label is None:
+        if row.is_prior:
             continue
         if row.name != "curve":
             residuals[row.label][row.name] = row.values
@@ -144,7 +144,7 @@ def _scatter(
     """Return the scatter of each curve over the scatter of N grains, and its standard error."""
     errors = np.sqrt(np.diag(covariance))
     return {
-        e.label or "": (float(np.exp(flat[e.place])), float(errors[e.place]))
+        e.label: (float(np.exp(flat[e.place])), float(errors[e.place]))
         for e in problem.list_elements(flat)
         if e.name == SCATTER
     }

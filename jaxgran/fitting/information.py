@@ -174,7 +174,7 @@ def weights_of_measurements(problem: Problem, found: Evaluation) -> dict[str, np
     p = problem.num_free
     parts = {m.label: np.zeros(p) for m in problem.measurements}
     for row in found.rows:
-        if not row.is_prior and row.label is not None:
+        if not row.is_prior:
             parts[row.label] = parts[row.label] + np.diag(row.information)[:p]
     whole = np.maximum(np.sum(list(parts.values()), axis=0), np.finfo(float).tiny)
     return {label: part / whole for label, part in parts.items()}

@@ -110,14 +110,14 @@ class Problem:
         gas = measurements[0].gas
 
         unknown = partial(build_unknown, curves=curves)
-        unknowns = [unknown(name, None, gas) for name in free]
+        unknowns = [unknown(name, SHARED, gas) for name in free]
         unknowns += [unknown(name, m.label, m.gas) for name in separate for m in curves]
         num_free = sum(u.size for u in unknowns)
         by_label = {SHARED: gas} | {m.label: m.gas for m in measurements}
         for label, some in priors.items():
-            known = tuple(u.name for u in unknowns if u.label in (None, label))
+            known = tuple(u.name for u in unknowns if u.applies_to(label))
             extra = extra_parameters(some, known)
-            unknowns += [unknown(name, label or None, by_label[label]) for name in extra]
+            unknowns += [unknown(name, label, by_label[label]) for name in extra]
         for m in measurements:
             unknowns += [Unknown(name, m.label, (), Domain()) for name in m.nuisances]
         displacement = any(m.displacement is not None for m in curves)
@@ -129,6 +129,10 @@ class Problem:
     def curves(self) -> tuple[CurveRows, ...]:
         """The measured curves."""
         return tuple(m for m in self.measurements if isinstance(m, CurveRows))
+
+    def _first_with(self, label: str) -> CurveRows | DropRows:
+        """Return the first measurement with the parameters of a label."""
+        return next(m for m in self.measurements if label in (SHARED, m.label))
 
     @property
     def places(self) -> dict[str, slice]:
@@ -184,8 +188,8 @@ class Problem:
         """
         parts = []
         for u in self.unknowns:
-            label = self.measurements[0].label if u.label is None else u.label
-            value = np.asarray(values[label].get(u.name, 0.0), float)
+            m = self._first_with(u.label)
+            value = np.asarray(values[m.label].get(u.name, 0.0), float)
             parts.append(np.ravel(u.domain.to_free(value) / u.unit))
         return _concatenated(parts)
 
@@ -217,9 +221,9 @@ class Problem:
         """Return SI values of all parameters that are varied, by label and name."""
         values = {m.label: dict(self.fixed.get(m.label, {})) for m in self.measurements}
         for u, value in self.split(flat):
-            labels = values.keys() if u.label is None else [u.label]
-            for label in labels:
-                values[label][u.name] = value
+            for label in values:
+                if u.applies_to(label):
+                    values[label][u.name] = value
         return values
 
     def list_elements(self, flat: np.ndarray) -> list[Element]:
@@ -285,10 +289,9 @@ class Problem:
     ) -> list[Residuals]:
         rows = []
         for label, priors in self.priors.items():
-            first = label or self.measurements[0].label
-            gas = next(m.gas for m in self.measurements if m.label == first)
-            for name, (row, slopes) in prior_residuals(priors, gas, values[first]).items():
-                rows.append(_of_unit_variance(name, label or None, row, slopes, elements))
+            m = self._first_with(label)
+            for name, (row, slopes) in prior_residuals(priors, m.gas, values[m.label]).items():
+                rows.append(_of_unit_variance(name, label, row, slopes, elements))
         return rows
 
     def compile_innovations(self, flat: np.ndarray) -> None:
@@ -312,12 +315,12 @@ def _concatenated(arrays: list[np.ndarray]) -> np.ndarray:
     return np.concatenate(arrays) if arrays else np.zeros(0)
 
 
-def build_unknown(name: str, label: str | None, gas: Gas, curves: Iterable[CurveRows]) -> Unknown:
-    """Return a parameter, of the measurement with a label or of all, as an unknown.
+def build_unknown(name: str, label: str, gas: Gas, curves: Iterable[CurveRows]) -> Unknown:
+    """Return a parameter as an unknown.
 
     Args:
         name: of a parameter of a gas, t0, or an error of T.
-        label: of the measurement; None if all share it.
+        label: of the measurement, or `SHARED`.
         gas: of the measurement.
         curves: all measured curves.
     """
@@ -326,7 +329,7 @@ def build_unknown(name: str, label: str | None, gas: Gas, curves: Iterable[Curve
     domain = domain_of(gas, name)
     if name != START_TIME:
         return Unknown(name, label, jnp.shape(gas.value(name)), domain)
-    unit = halving_time(next(m.curve for m in curves if label in (None, m.label)))
+    unit = halving_time(next(m.curve for m in curves if label in (SHARED, m.label)))
     return Unknown(name, label, (), domain, float(unit))
 
 
@@ -386,7 +389,7 @@ def _nuisance_residuals(
 
 def _of_unit_variance(
     name: str,
-    label: str | None,
+    label: str,
     values: Any,
     slopes: dict[str, Any],
     elements: list[Element],
@@ -396,7 +399,7 @@ def _of_unit_variance(
     values = np.asarray(values, float)
     matrix = np.zeros((values.size, len(elements)))
     for e in elements:
-        applies = label is None or e.applies_to(label)
+        applies = label == SHARED or e.applies_to(label)
         if applies and e.name in slopes:
             matrix[:, e.place] = np.asarray(slopes[e.name])[:, e.number] * e.slope
     return Residuals(

@@ -194,7 +194,7 @@ def _values_of_guesses(problem: Problem, guesses: dict[str, Gas]) -> dict[str, d
     """Return the values of gases and a guess of t0, by label and name."""
     values: dict[str, dict[str, Any]] = {label: gas.parameters for label, gas in guesses.items()}
     for m in problem.curves:
-        names = tuple(u.name for u in problem.unknowns if u.label in (None, m.label))
+        names = tuple(u.name for u in problem.unknowns if u.applies_to(m.label))
         known = known_start_time(problem.priors, m.label)
         values[m.label][START_TIME] = guess_start_time(guesses[m.label], m.curve, names, known)
     return values

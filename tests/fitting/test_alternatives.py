@@ -15,7 +15,7 @@ from jaxgran.fitting.alternatives import Alternative, Explanations
 from jaxgran.fitting.goodness import Goodness
 from jaxgran.fitting.kinds import KINDS, WALLS_ADDED, FittedCurve
 from jaxgran.fitting.measured_rows import curve_rows
-from jaxgran.fitting.parameters import Unknown
+from jaxgran.fitting.parameters import SHARED, Unknown
 from jaxgran.fitting.problem import Evaluation, Problem
 from jaxgran.fitting.profiles import Trial
 from jaxgran.fitting.reasons import describe_search
@@ -337,7 +337,7 @@ def parabola(minimum=0.0, name=A, **changes):
             return Evaluation(value, 2 * distance, np.eye(1), [], {})
 
     theory = jaxgran.KineticTheory()
-    unknowns = (Unknown(name, None, (), Domain()),)
+    unknowns = (Unknown(name, SHARED, (), Domain()),)
     known = {"measurements": (), "model": theory, "simplified_model": theory, "priors": {}}
     return Parabola(**(known | changes), unknowns=unknowns, num_free=1)
 
