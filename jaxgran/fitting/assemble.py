@@ -8,6 +8,7 @@ from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.data.curve import CoolingCurve, above_noise
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.alternatives import Explanations
+from jaxgran.fitting.evaluation import Evaluation
 from jaxgran.fitting.goodness import Goodness
 from jaxgran.fitting.information import (
     covariance_of_minima,
@@ -18,7 +19,7 @@ from jaxgran.fitting.information import (
     weights_of_measurements,
 )
 from jaxgran.fitting.parameters import as_floats, with_parameters
-from jaxgran.fitting.problem import Evaluation, Problem
+from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.rows import SCATTER, WHITE, CurveRows
 from jaxgran.fitting.search import Solution

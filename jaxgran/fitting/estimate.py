@@ -9,11 +9,12 @@ from jaxgran.fitting.alternatives import compare_alternatives
 from jaxgran.fitting.assemble import assemble_fit
 from jaxgran.fitting.conclusions import with_conclusions
 from jaxgran.fitting.descent import Descent
+from jaxgran.fitting.evaluation import Evaluation
 from jaxgran.fitting.goodness import SIGNIFICANCE, Goodness, goodness, measurement_share
 from jaxgran.fitting.information import DEGENERATE
 from jaxgran.fitting.outliers import describe_outliers
 from jaxgran.fitting.prediction import TINY
-from jaxgran.fitting.problem import Evaluation, Problem, build_unknown
+from jaxgran.fitting.problem import Problem, build_unknown
 from jaxgran.fitting.profiles import ALLOWED
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.rows import SCATTER, WHITE, CurveRows, has_no_measured_errors

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxgran.fitting.comparison import Residuals
-from jaxgran.fitting.problem import Evaluation, Problem
+from jaxgran.fitting.evaluation import Evaluation
+from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.rows import FEW_PARTICLES, MEASUREMENT, MODEL, SAMPLING, SCATTER, SIMULATION
 from jaxgran.fitting.search import Minimum, Solution
 from jaxgran.scene.laws import RestitutionLaw

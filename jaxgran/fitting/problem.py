@@ -1,27 +1,25 @@
-"""The problem of a fit: measurements, unknowns, and -2 ln L with its derivatives."""
+"""The problem of a fit: measurements, a model, and the unknowns that are varied."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from jaxgran._utils.validation import POSITIVE, Domain
-from jaxgran.data.drop_test import SPHERE
 from jaxgran.data.measurement import START_TIME, Priors
-from jaxgran.fitting.comparison import Comparison, Residuals
-from jaxgran.fitting.guesses import halving_time
-from jaxgran.fitting.parameters import (
-    SHARED,
-    Unknown,
-    domain_of,
-    extra_parameters,
-    prior_residuals,
-    residuals_and_slopes,
+from jaxgran.fitting.comparison import Comparison
+from jaxgran.fitting.evaluation import (
+    Evaluation,
+    compare_drops,
+    residuals_of_nuisances,
+    residuals_of_priors,
+    sum_residuals,
 )
+from jaxgran.fitting.guesses import halving_time
+from jaxgran.fitting.parameters import SHARED, Unknown, domain_of, extra_parameters
 from jaxgran.fitting.prediction import Element, PredictedCurve, predicted_curve, steady_curve
 from jaxgran.fitting.rows import FLOOR, WHITE, CurveRows, DropRows
 from jaxgran.models.base import AbstractModel
@@ -30,32 +28,6 @@ from jaxgran.scene.gas import Gas
 MAX_KEPT = 8
 """Number of evaluations that a problem keeps: a search needs the last one again after a rejected
 step, and an error budget needs the one at the estimate after the factors of variances varied."""
-
-
-class Evaluation(NamedTuple):
-    """-2 ln L at some values of the unknowns.
-
-    Attributes:
-        value: -2 ln L, up to a constant.
-        gradient: its derivatives.
-        information: half of its expected second derivatives.
-        rows: the residuals.
-        curves: the computed curves at the times of the data, dictionaries of their fields.
-        scatter_of_eps: standard deviation of eps that impacts of two spheres show; None without
-            such impacts.
-    """
-
-    value: float
-    gradient: Float[np.ndarray, "unknowns"]
-    information: Float[np.ndarray, "unknowns unknowns"]
-    rows: list[Residuals]
-    curves: dict[str, dict[str, Any]]
-    scatter_of_eps: float | None = None
-
-    @property
-    def is_finite(self) -> bool:
-        """Whether the model could compute the curves."""
-        return bool(np.isfinite(self.value) and np.all(np.isfinite(self.information)))
 
 
 @dataclass(frozen=True)
@@ -86,7 +58,7 @@ class Problem:
     _evaluations: dict[tuple[Any, ...], Evaluation] = field(
         init=False, default_factory=dict, compare=False
     )
-    _curves: dict[str, tuple[bytes, PredictedCurve]] = field(
+    _predicted: dict[str, tuple[bytes, PredictedCurve]] = field(
         init=False, default_factory=dict, compare=False
     )
 
@@ -129,10 +101,6 @@ class Problem:
     def curves(self) -> tuple[CurveRows, ...]:
         """The measured curves."""
         return tuple(m for m in self.measurements if isinstance(m, CurveRows))
-
-    def _first_with(self, label: str) -> CurveRows | DropRows:
-        """Return the first measurement with the parameters of a label."""
-        return next(m for m in self.measurements if label in (SHARED, m.label))
 
     @property
     def places(self) -> dict[str, slice]:
@@ -235,6 +203,10 @@ class Problem:
             for place, (u, number) in enumerate(places)
         ]
 
+    def _first_with(self, label: str) -> CurveRows | DropRows:
+        """Return the first measurement with the parameters of a label."""
+        return next(m for m in self.measurements if label in (SHARED, m.label))
+
     def evaluate(self, flat: np.ndarray, **sources: float) -> Evaluation:
         """Return -2 ln L at the unknowns, with its derivatives.
 
@@ -254,45 +226,32 @@ class Problem:
     def _evaluate(self, flat: np.ndarray, sources: dict[str, float]) -> Evaluation:
         values = self.unflatten(flat)
         elements = self.list_elements(flat)
-        impacts = [
-            (m, _compared_impacts(m, values[m.label]))
-            for m in self.measurements
-            if isinstance(m, DropRows)
-        ]
-        scatter = _common_scatter(impacts)
-        rows = [_impact_residuals(m, found, elements) for m, found in impacts]
+        drops = [m for m in self.measurements if isinstance(m, DropRows)]
+        rows, scatter = compare_drops(drops, values, elements)
         curves: dict[str, dict[str, Any]] = {}
         for m in self.curves:
             own = values[m.label]
             if scatter is not None and "spread" in m.gas.domains:
                 own = {"spread": scatter} | own
-            curve = self._curve(m, flat, own, elements)
+            curve = self._predict(m, flat, own, elements)
             rows += Comparison(curve, sources).residuals(len(elements))
-            rows += _nuisance_residuals(m, own, elements)
+            rows += residuals_of_nuisances(m, own, elements)
             curves[m.label] = curve.fields
-        rows += self._prior_residuals(values, elements)
-        return summed(rows, curves, scatter)
+        for label, priors in self.priors.items():
+            m = self._first_with(label)
+            rows += residuals_of_priors(label, priors, m.gas, values[m.label], elements)
+        return sum_residuals(rows, curves, scatter)
 
-    def _curve(
+    def _predict(
         self, m: CurveRows, flat: np.ndarray, values: dict[str, Any], elements: list[Element]
     ) -> PredictedCurve:
-        """Return a computed curve: it is computed once for all factors of the variances."""
-        known, curve = self._curves.get(m.label, (b"", None))
+        """Return a predicted curve, which is computed once for all factors of the variances."""
+        known, curve = self._predicted.get(m.label, (b"", None))
         if curve is None or known != flat.tobytes():
             own = [e for e in elements if e.applies_to(m.label)]
             curve = predicted_curve(m, self.simplified_model, values, own, self.tolerance)
-            self._curves[m.label] = flat.tobytes(), curve
+            self._predicted[m.label] = flat.tobytes(), curve
         return curve
-
-    def _prior_residuals(
-        self, values: dict[str, dict[str, Any]], elements: list[Element]
-    ) -> list[Residuals]:
-        rows = []
-        for label, priors in self.priors.items():
-            m = self._first_with(label)
-            for name, (row, slopes) in prior_residuals(priors, m.gas, values[m.label]).items():
-                rows.append(_of_unit_variance(name, label, row, slopes, elements))
-        return rows
 
     def compile_innovations(self, flat: np.ndarray) -> None:
         """Compile what an evaluation needs apart from the curves, whatever these are."""
@@ -331,104 +290,3 @@ def build_unknown(name: str, label: str, gas: Gas, curves: Iterable[CurveRows]) 
         return Unknown(name, label, jnp.shape(gas.value(name)), domain)
     unit = halving_time(next(m.curve for m in curves if label in (SHARED, m.label)))
     return Unknown(name, label, (), domain, float(unit))
-
-
-class _ComparedImpacts(NamedTuple):
-    """Measured impacts beside the impacts of a gas.
-
-    Attributes:
-        residuals: measured minus computed values over their errors, shape (values,).
-        slopes: derivatives of the residuals in SI values, by parameter.
-        scatter: standard deviation of eps from impact to impact.
-        widening: factor by which this widens each error, shape (values,).
-    """
-
-    residuals: np.ndarray
-    slopes: dict[str, Any]
-    scatter: float
-    widening: np.ndarray
-
-
-def _compared_impacts(m: DropRows, values: dict[str, Any]) -> _ComparedImpacts:
-    floats = {name: jnp.asarray(x) for name, x in values.items() if name in m.gas.domains}
-    residuals, slopes = residuals_and_slopes(m.data.residuals, m.gas, floats)
-    residuals = np.asarray(residuals)
-    scatter = m.scatter_of_eps(floats, residuals)
-    return _ComparedImpacts(residuals, slopes, scatter, m.widening(floats, scatter))
-
-
-def _common_scatter(impacts: list[tuple[DropRows, _ComparedImpacts]]) -> float | None:
-    """Return the standard deviation of eps over all impacts of two spheres whose eps scatters."""
-    found = [(m, x) for m, x in impacts if m.data.onto == SPHERE and m.data.scatters]
-    if not found:
-        return None
-    squares = [x.scatter**2 for _, x in found]
-    return float(np.average(squares, weights=[m.num_points for m, _ in found]) ** 0.5)
-
-
-def _impact_residuals(m: DropRows, found: _ComparedImpacts, elements: list[Element]) -> Residuals:
-    """Return the residuals of a drop test, whose errors the scatter of eps widens."""
-    slopes = {name: x / found.widening[:, None] for name, x in found.slopes.items()}
-    row = _of_unit_variance(
-        "drop test", m.label, found.residuals / found.widening, slopes, elements, is_prior=False
-    )
-    return row._replace(log_variance=2 * np.log(found.widening))
-
-
-def _nuisance_residuals(
-    m: CurveRows, values: dict[str, Any], elements: list[Element]
-) -> list[Residuals]:
-    """Return the residuals of nuisance parameters, whose expected value is 0."""
-    rows = []
-    for name, error in m.nuisances.items():
-        slopes = {name: np.ones((1, 1)) / error}
-        row = np.atleast_1d(values[name]) / error
-        rows.append(_of_unit_variance(name, m.label, row, slopes, elements))
-    return rows
-
-
-def _of_unit_variance(
-    name: str,
-    label: str,
-    values: Any,
-    slopes: dict[str, Any],
-    elements: list[Element],
-    is_prior: bool = True,
-) -> Residuals:
-    """Return residuals of variance 1, from their derivatives in SI values by parameter."""
-    values = np.asarray(values, float)
-    matrix = np.zeros((values.size, len(elements)))
-    for e in elements:
-        applies = label == SHARED or e.applies_to(label)
-        if applies and e.name in slopes:
-            matrix[:, e.place] = np.asarray(slopes[e.name])[:, e.number] * e.slope
-    return Residuals(
-        name,
-        label,
-        values=values,
-        slopes=matrix,
-        log_variance=np.zeros(values.size),
-        log_slopes=np.zeros_like(matrix),
-        is_prior=is_prior,
-    )
-
-
-def summed(
-    rows: list[Residuals],
-    curves: dict[str, dict[str, Any]],
-    scatter_of_eps: float | None = None,
-) -> Evaluation:
-    """Return -2 ln L of independent residuals, with its derivatives.
-
-    Args:
-        rows, curves, scatter_of_eps: see `Evaluation`.
-    """
-    value = 0.0
-    size = rows[0].slopes.shape[1]
-    gradient = np.zeros(size)
-    information = np.zeros((size, size))
-    for row in rows:
-        value += float(np.sum(row.values**2) + np.sum(row.log_variance))
-        gradient += 2 * row.values @ row.slopes + (1 - row.values**2) @ row.log_slopes
-        information += row.information
-    return Evaluation(value, gradient, information, rows, curves, scatter_of_eps)

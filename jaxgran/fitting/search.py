@@ -12,7 +12,8 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
-from jaxgran.fitting.problem import Evaluation, Problem
+from jaxgran.fitting.evaluation import Evaluation
+from jaxgran.fitting.problem import Problem
 
 LAST_STEP = 0.01
 """A search ends where the next Newton step is shorter than this, in standard errors."""

@@ -15,12 +15,13 @@ from jaxgran.fitting.comparison import Residuals
 from jaxgran.fitting.conclusions import with_conclusions
 from jaxgran.fitting.descent import Descent
 from jaxgran.fitting.estimate import fit_without_noise
+from jaxgran.fitting.evaluation import sum_residuals
 from jaxgran.fitting.goodness import goodness
 from jaxgran.fitting.information import undetermined
 from jaxgran.fitting.measured_rows import curve_rows, with_rate_error
 from jaxgran.fitting.parameters import as_floats, with_parameters
 from jaxgran.fitting.prediction import predicted_curve
-from jaxgran.fitting.problem import Problem, summed
+from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.rows import SLOPE
 from jaxgran.fitting.search import Minimum
@@ -168,7 +169,7 @@ def _result(
         )
         notes = [*notes, note]
     rows = _residuals(search, expansion)
-    found = summed([rows], {})
+    found = sum_residuals([rows], {})
     scatter_error = (2 / expansion.degrees_of_freedom) ** 0.5
     result = Fit(
         names=tuple(problem.places),

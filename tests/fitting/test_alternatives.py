@@ -12,11 +12,12 @@ import jaxgran
 from jaxgran._utils.validation import Domain
 from jaxgran.fitting import alternatives, estimate, profiles
 from jaxgran.fitting.alternatives import Alternative, Explanations
+from jaxgran.fitting.evaluation import Evaluation
 from jaxgran.fitting.goodness import Goodness
 from jaxgran.fitting.kinds import KINDS, WALLS_ADDED, FittedCurve
 from jaxgran.fitting.measured_rows import curve_rows
 from jaxgran.fitting.parameters import SHARED, Unknown
-from jaxgran.fitting.problem import Evaluation, Problem
+from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.profiles import Trial
 from jaxgran.fitting.reasons import describe_search
 from jaxgran.fitting.search import MAX_DISTANCE
