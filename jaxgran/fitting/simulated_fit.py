@@ -39,7 +39,7 @@ from jaxgran.fitting.simulated_errors import (
 )
 from jaxgran.fitting.simulations import (
     MAX_LINEARISED,
-    Search,
+    SearchResult,
     Simulations,
     by_descent,
     by_gauss_newton,
@@ -136,7 +136,7 @@ def _result(
     request: Request,
     of_theory: Request,
     sims: Simulations,
-    search: Search,
+    search: SearchResult,
     notes: Sequence[str],
 ) -> Fit:
     """Return the result of a search through simulations."""
@@ -200,7 +200,7 @@ def _result(
     return with_conclusions(request, result, explanations, notes, share)
 
 
-def _residuals(search: Search, expansion: Expansion) -> Residuals:
+def _residuals(search: SearchResult, expansion: Expansion) -> Residuals:
     """Return the residuals of the measured values and their derivatives in the unknowns."""
     (whole,) = search.average.comparison.residuals(0)
     return Residuals(
@@ -221,7 +221,7 @@ def _residuals_by_field(sims: Simulations, rows: Residuals) -> dict[str, np.ndar
     return by_field
 
 
-def _share_of_errors(sims: Simulations, search: Search, rows: Residuals) -> float:
+def _share_of_errors(sims: Simulations, search: SearchResult, rows: Residuals) -> float:
     """Return the mean share of the variance of ln T that the errors of the measurement have."""
     used = sims.theory.used[:, 0] > 0
     relative = sims.theory.errors[:, 0] / np.asarray(search.curve.temperature)
@@ -231,7 +231,7 @@ def _share_of_errors(sims: Simulations, search: Search, rows: Residuals) -> floa
 
 def _explanations(
     of_theory: Request,
-    search: Search,
+    search: SearchResult,
     model_values: np.ndarray,
     noise: np.ndarray,
 ) -> Explanations | None:
