@@ -139,15 +139,15 @@ class Explanations(NamedTuple):
 
 
 def compare_alternatives(
-    problem: Problem, minima: list[Minimum], noise: Float[np.ndarray, "p"]
+    problem: Problem, minima: list[Minimum], further_errors: Float[np.ndarray, "p"]
 ) -> Explanations | None:
     """Compare a fitted law with its alternatives; a driven gas has none.
 
     Args:
         problem: of a model that supports all alternatives, at the minima of the fit.
         minima: minima of -2 ln L that the data allow.
-        noise: standard errors of the free parameters, in their unconstrained scale, that the
-            problem does not contain.
+        further_errors: standard errors of the free parameters that the problem does not contain, in
+            their unconstrained scale.
 
     Returns:
         None if the law cannot be computed.
@@ -162,7 +162,7 @@ def compare_alternatives(
     stages = _fit_stages(problem, bases, kinds, significant)
     trials = [trial for stage in stages for trial in stage.trials_with_A()]
     best = min([*bases, *trials], key=lambda trial: trial.value)
-    summary = _Summary(problem, bases[0], best, significant, noise)
+    summary = _Summary(problem, bases[0], best, significant, further_errors)
     law = summary.summarise_law(bases)
     by_kinds: dict[tuple[Kind, ...], Alternative] = {}
     for stage in stages:
@@ -358,14 +358,14 @@ class _Summary(NamedTuple):
         base: the fitted law.
         best: the best of all trials in which A has a meaning.
         significant: decrease of -2 ln L from which an explanation excludes others.
-        noise: see `compare_alternatives`.
+        further_errors: see `compare_alternatives`.
     """
 
     problem: Problem
     base: Trial
     best: Trial
     significant: float
-    noise: Float[np.ndarray, "p"]
+    further_errors: Float[np.ndarray, "p"]
 
     def summarise_law(self, bases: list[Trial]) -> Alternative:
         """Return the law itself, from all its minima."""
@@ -456,7 +456,8 @@ class _Summary(NamedTuple):
         in their unconstrained scale, and their errors."""
         size = self.problem.num_free
         rows = [
-            [t.value, t.amplitude, *t.flat[:size], *np.hypot(t.error, self.noise)] for t in trials
+            [t.value, t.amplitude, *t.flat[:size], *np.hypot(t.error, self.further_errors)]
+            for t in trials
         ]
         known = np.arange(len(trials))
         fine = np.linspace(0, len(trials) - 1, NUM_BETWEEN * (len(trials) - 1) + 1)

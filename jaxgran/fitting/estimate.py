@@ -54,8 +54,8 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
     is_distant = _is_distant(solution.problem, found)
     explanations = None
     if solution.best.converged and not (request.quick or is_distant):
-        noise = np.zeros(problem.num_free)
-        explanations = compare_alternatives(solution.problem, solution.minima, noise)
+        further_errors = np.zeros(problem.num_free)
+        explanations = compare_alternatives(solution.problem, solution.minima, further_errors)
     quality = _goodness_without_errors_of_T(plain, solution)
     result = assemble_fit(request, solution, explanations, quality)
     notes = [*notes_on_data]

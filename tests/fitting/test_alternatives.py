@@ -354,7 +354,7 @@ def test_a_trial_at_the_edge_of_the_region_has_the_misfit_of_the_edge():
 
 
 def summary_of(problem, base):
-    return alternatives._Summary(problem, base, base, significant=10.0, noise=np.zeros(1))
+    return alternatives._Summary(problem, base, base, significant=10.0, further_errors=np.zeros(1))
 
 
 def test_a_widening_is_compared_with_1_where_the_estimate_is_0():
