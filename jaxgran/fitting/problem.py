@@ -80,7 +80,6 @@ class Problem:
         """
         curves = [m for m in measurements if isinstance(m, CurveRows)]
         gas = measurements[0].gas
-
         unknown = partial(build_unknown, curves=curves)
         unknowns = [unknown(name, SHARED, gas) for name in free]
         unknowns += [unknown(name, m.label, m.gas) for name in separate for m in curves]
