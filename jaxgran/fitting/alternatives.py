@@ -22,8 +22,8 @@ from jaxtyping import Float
 
 from jaxgran.fitting.goodness import SIGNIFICANCE, goodness
 from jaxgran.fitting.kinds import Kind, kinds_of
-from jaxgran.fitting.parameters import magnitude_of, with_values
-from jaxgran.fitting.problem import Problem, unknown_of
+from jaxgran.fitting.parameters import SHARED, magnitude_of, with_values
+from jaxgran.fitting.problem import Problem, build_unknown
 from jaxgran.fitting.profiles import ALLOWED, ALLOWED_OVER_ALL, Trial, profile_of, trial_of
 from jaxgran.fitting.rows import WHITE
 from jaxgran.fitting.search import Minimum
@@ -139,15 +139,15 @@ class Explanations(NamedTuple):
 
 
 def compare_alternatives(
-    problem: Problem, minima: list[Minimum], noise: Float[np.ndarray, "p"]
+    problem: Problem, minima: list[Minimum], further_errors: Float[np.ndarray, "p"]
 ) -> Explanations | None:
     """Compare a fitted law with its alternatives; a driven gas has none.
 
     Args:
         problem: of a model that supports all alternatives, at the minima of the fit.
         minima: minima of -2 ln L that the data allow.
-        noise: standard errors of the free parameters, in their unconstrained scale, that the
-            problem does not contain.
+        further_errors: standard errors of the free parameters that the problem does not contain, in
+            their unconstrained scale.
 
     Returns:
         None if the law cannot be computed.
@@ -162,7 +162,7 @@ def compare_alternatives(
     stages = _fit_stages(problem, bases, kinds, significant)
     trials = [trial for stage in stages for trial in stage.trials_with_A()]
     best = min([*bases, *trials], key=lambda trial: trial.value)
-    summary = _Summary(problem, bases[0], best, significant, noise)
+    summary = _Summary(problem, bases[0], best, significant, further_errors)
     law = summary.summarise_law(bases)
     by_kinds: dict[tuple[Kind, ...], Alternative] = {}
     for stage in stages:
@@ -317,14 +317,14 @@ def _fit_beside(stage: _Stage, effect: Kind) -> _Stage | None:
     start = []
     # Drop tests have the law of impacts, too: all measurements share its parameter.
     for label in labels[:1] if effect.changes_law else labels:
-        place = None if effect.changes_law else label
-        unknown = unknown_of(effect.varied, place, gases[label], problem.curves)
+        owner = SHARED if effect.changes_law else label
+        unknown = build_unknown(effect.varied, owner, gases[label], problem.curves)
         unknowns.append(unknown)
         start.append(unknown.domain.to_free(guesses[label]) / unknown.unit)
     both = replace(
         effect.with_wider_rate_errors(problem, at_best.amplitude),
         unknowns=(*problem.unknowns, *unknowns),
-        fixed=problem.fixed_with(fixed),
+        fixed=problem.extend_fixed(fixed),
     )
     origin = np.append(stage.origin, start)
     base = trial_of(both, 0.0, np.append(at_best.flat, start), origin)
@@ -358,14 +358,14 @@ class _Summary(NamedTuple):
         base: the fitted law.
         best: the best of all trials in which A has a meaning.
         significant: decrease of -2 ln L from which an explanation excludes others.
-        noise: see `compare_alternatives`.
+        further_errors: see `compare_alternatives`.
     """
 
     problem: Problem
     base: Trial
     best: Trial
     significant: float
-    noise: Float[np.ndarray, "p"]
+    further_errors: Float[np.ndarray, "p"]
 
     def summarise_law(self, bases: list[Trial]) -> Alternative:
         """Return the law itself, from all its minima."""
@@ -378,7 +378,7 @@ class _Summary(NamedTuple):
             amplitude=self.base.amplitude,
             allowed=allowed.amplitudes,
             improvement=0.0,
-            estimate=self.problem.estimates(self.base.flat),
+            estimate=self.problem.to_estimates(self.base.flat),
             low=allowed.low,
             high=allowed.high,
             preferred=False,
@@ -408,7 +408,7 @@ class _Summary(NamedTuple):
             amplitude=best.amplitude,
             allowed=(best.amplitude, best.amplitude),
             improvement=improvement,
-            estimate=self.problem.estimates(best.flat),
+            estimate=self.problem.to_estimates(best.flat),
             low=beside.low,
             high=beside.high,
             preferred=bool(improvement - beside.improvement > self.significant),
@@ -456,7 +456,8 @@ class _Summary(NamedTuple):
         in their unconstrained scale, and their errors."""
         size = self.problem.num_free
         rows = [
-            [t.value, t.amplitude, *t.flat[:size], *np.hypot(t.error, self.noise)] for t in trials
+            [t.value, t.amplitude, *t.flat[:size], *np.hypot(t.error, self.further_errors)]
+            for t in trials
         ]
         known = np.arange(len(trials))
         fine = np.linspace(0, len(trials) - 1, NUM_BETWEEN * (len(trials) - 1) + 1)
@@ -467,17 +468,17 @@ class _Summary(NamedTuple):
         """Whether the unconstrained scale of each free parameter is a logarithm."""
         domains = [u.domain for u in self.problem.unknowns]
         is_positive = [np.isfinite(x.low) and not np.isfinite(x.high) for x in domains]
-        return self.problem.per_element(is_positive)[: self.problem.num_free]
+        return self.problem.repeat_per_element(is_positive)[: self.problem.num_free]
 
     def _to_si(self, free: np.ndarray, best: Trial) -> np.ndarray:
         with np.errstate(over="ignore"):
-            return self.problem.estimates(np.append(free, best.flat[free.size :]))
+            return self.problem.to_estimates(np.append(free, best.flat[free.size :]))
 
 
 def _constant_restitution(problem: Problem, trial: Trial) -> float:
     """Return eps of a trial in which it is constant."""
     m = problem.curves[0]
-    values = problem.values(trial.flat)[m.label]
+    values = problem.unflatten(trial.flat)[m.label]
     known = {name: x for name, x in values.items() if name in m.gas.domains}
     gas = with_values(m.gas, known | {"exponent": 0.0})
     return float(gas.restitution(VARIANT_SPEED))

@@ -8,6 +8,7 @@ from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.data.curve import CoolingCurve, above_noise
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.alternatives import Explanations
+from jaxgran.fitting.evaluation import Evaluation
 from jaxgran.fitting.goodness import Goodness
 from jaxgran.fitting.information import (
     covariance_of_minima,
@@ -18,7 +19,7 @@ from jaxgran.fitting.information import (
     weights_of_measurements,
 )
 from jaxgran.fitting.parameters import as_floats, with_parameters
-from jaxgran.fitting.problem import Evaluation, Problem
+from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.rows import SCATTER, WHITE, CurveRows
 from jaxgran.fitting.search import Solution
@@ -41,7 +42,7 @@ def assemble_fit(
     problem, best, _ = solution
     found = solution.evaluate()
     covariance = inverse(found.information)
-    values = problem.values(best.flat)
+    values = problem.unflatten(best.flat)
     gases = {m.label: _fitted_gas(m.scene, values[m.label]) for m in problem.measurements}
     curves: dict[str, CoolingCurve | None] = dict.fromkeys(gases)
     for m in problem.curves:
@@ -54,7 +55,7 @@ def assemble_fit(
         measurements=request.measurements,
         gas=gases[""] if is_single else gases,
         curve=curves[""] if is_single else curves,
-        estimate=problem.estimates(best.flat),
+        estimate=problem.to_estimates(best.flat),
         covariances=_covariances(solution, covariance),
         ranges=parameter_ranges(problem, explanations),
         alternatives=() if explanations is None else explanations.alternatives,
@@ -63,7 +64,7 @@ def assemble_fit(
         residuals=_residuals(problem, found),
         scatter=_scatter(problem, best.flat, covariance),
         errors_of_T={
-            u.label or "": float(error) for u, error in problem.parts(best.flat) if u.name == WHITE
+            u.label: float(error) for u, error in problem.split(best.flat) if u.name == WHITE
         },
         scales={m.label: describe_gas(gases[m.label], m) for m in problem.curves},
         start_time={m.label: float(values[m.label].get(START_TIME, 0.0)) for m in problem.curves},
@@ -102,7 +103,7 @@ def _covariances(solution: Solution, covariance: np.ndarray) -> dict[str, np.nda
     """
     problem = solution.problem
     p = problem.num_free
-    to_si = problem.slopes(solution.best.flat)[:, None] * covariance
+    to_si = problem.compute_slopes(solution.best.flat)[:, None] * covariance
     parts = information_by_source(solution)
     covariances = {name: (to_si @ part @ to_si.T)[:p, :p] for name, part in parts.items()}
     of_minima = covariance_of_minima(solution, covariance)
@@ -126,7 +127,7 @@ def _residuals(problem: Problem, found: Evaluation) -> dict[str, dict[str, np.nd
     residuals: dict[str, dict[str, np.ndarray]] = {m.label: {} for m in problem.measurements}
     curves = {m.label: m for m in problem.curves}
     for row in found.rows:
-        if row.is_prior or row.label is None:
+        if row.is_prior:
             continue
         if row.name != "curve":
             residuals[row.label][row.name] = row.values
@@ -144,8 +145,8 @@ def _scatter(
     """Return the scatter of each curve over the scatter of N grains, and its standard error."""
     errors = np.sqrt(np.diag(covariance))
     return {
-        e.label or "": (float(np.exp(flat[e.place])), float(errors[e.place]))
-        for e in problem.elements(flat)
+        e.label: (float(np.exp(flat[e.place])), float(errors[e.place]))
+        for e in problem.list_elements(flat)
         if e.name == SCATTER
     }
 

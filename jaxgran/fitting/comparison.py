@@ -40,7 +40,7 @@ class Residuals(NamedTuple):
     Attributes:
         name: what they belong to: "curve", "displacement", "drop test", or the name of a prior or
             of a nuisance parameter.
-        label: of the measurement; None for priors of shared parameters.
+        label: of the measurement; `SHARED` for priors of shared parameters.
         values: over their standard deviation, shape (n,); 0 where nothing was measured.
         slopes: derivatives at fixed standard deviations, shape (n, unknowns).
         log_variance: logarithm of their variances, shape (n,).
@@ -49,7 +49,7 @@ class Residuals(NamedTuple):
     """
 
     name: str
-    label: str | None
+    label: str
     values: Float[np.ndarray, "n"]
     slopes: Float[np.ndarray, "n unknowns"]
     log_variance: Float[np.ndarray, "n"]

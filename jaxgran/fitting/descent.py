@@ -97,7 +97,7 @@ class Descent:
             return Loss(found.value, found.gradient, newton_step(found).length)
 
         size = sum(row.values.size for row in problem.evaluate(first).rows)
-        course = self.descend(loss, first, max_steps, size, problem.estimates, noisy=False)
+        course = self.descend(loss, first, max_steps, size, problem.to_estimates, noisy=False)
         best = int(np.argmin(course.losses))
         return Minimum(
             flat=course.flats[best],
@@ -113,7 +113,7 @@ class Descent:
         first: np.ndarray,
         max_steps: int,
         size: int,
-        estimates: Callable[[np.ndarray], np.ndarray],
+        to_estimates: Callable[[np.ndarray], np.ndarray],
         *,
         noisy: bool,
     ) -> Course:
@@ -124,7 +124,7 @@ class Descent:
             first: the first guess.
             max_steps: maximum number of steps.
             size: number of residuals.
-            estimates: SI values of the free parameters at some unknowns.
+            to_estimates: gives SI values of the free parameters at some unknowns.
             noisy: whether the loss has noise.
 
         Raises:
@@ -162,7 +162,7 @@ class Descent:
             losses=np.where(np.isnan(values), np.inf, values),
             converged=ending.converged,
             diverged=ending.diverged,
-            trace=Trace(values, np.stack([estimates(x) for x in flats]), ending.reason),
+            trace=Trace(values, np.stack([to_estimates(x) for x in flats]), ending.reason),
         )
 
     @cached_property

@@ -9,11 +9,12 @@ from jaxgran.fitting.alternatives import compare_alternatives
 from jaxgran.fitting.assemble import assemble_fit
 from jaxgran.fitting.conclusions import with_conclusions
 from jaxgran.fitting.descent import Descent
+from jaxgran.fitting.evaluation import Evaluation
 from jaxgran.fitting.goodness import SIGNIFICANCE, Goodness, goodness, measurement_share
 from jaxgran.fitting.information import DEGENERATE
 from jaxgran.fitting.outliers import describe_outliers
 from jaxgran.fitting.prediction import TINY
-from jaxgran.fitting.problem import Evaluation, Problem, unknown_of
+from jaxgran.fitting.problem import Problem, build_unknown
 from jaxgran.fitting.profiles import ALLOWED
 from jaxgran.fitting.result import Fit
 from jaxgran.fitting.rows import SCATTER, WHITE, CurveRows, has_no_measured_errors
@@ -53,8 +54,8 @@ def fit_without_noise(request: Request, max_steps: int, descent: Descent | None 
     is_distant = _is_distant(solution.problem, found)
     explanations = None
     if solution.best.converged and not (request.quick or is_distant):
-        noise = np.zeros(problem.num_free)
-        explanations = compare_alternatives(solution.problem, solution.minima, noise)
+        further_errors = np.zeros(problem.num_free)
+        explanations = compare_alternatives(solution.problem, solution.minima, further_errors)
     quality = _goodness_without_errors_of_T(plain, solution)
     result = assemble_fit(request, solution, explanations, quality)
     notes = [*notes_on_data]
@@ -95,7 +96,7 @@ def _solve_by_newton(problem: Problem, first: np.ndarray, max_steps: int) -> Sol
     The first search has the scatter that N gives. The second one finds it, too, with the errors of
     the model's cooling rate in the gas that the first one found.
     """
-    held, is_left = problem.holding(SCATTER)
+    held, is_left = problem.hold_at_zero(SCATTER)
     minima = minima_from_starts(held, first[is_left], max_steps)
     begun = deepest(minima)
     _check_computed(held, begun)
@@ -123,7 +124,7 @@ def _with_errors_of_T(plain: Solution, first: np.ndarray, max_steps: int) -> Sol
     if not bare:
         return plain
     computed = problem.evaluate(first).curves
-    unknowns = [unknown_of(WHITE, m.label, m.scene, problem.curves) for m in bare]
+    unknowns = [build_unknown(WHITE, m.label, m.scene, problem.curves) for m in bare]
     sizes = [_guess_of_error(m, computed[m.label]["temperature"]) for m in bare]
     wider = replace(problem, unknowns=(*problem.unknowns, *unknowns))
     try:
@@ -151,7 +152,7 @@ def _check_computed(problem: Problem, minimum: Minimum) -> None:
     for curve in problem.evaluate(minimum.flat).curves.values():
         fault = int(curve.get("status", status.OK))
         if fault != status.OK:
-            values = [np.asarray(value) for _, value in problem.parts(minimum.flat)]
+            values = [np.asarray(value) for _, value in problem.split(minimum.flat)]
             free = zip(problem.places, values, strict=False)
             at = ", ".join(f"{name} = {np.array2string(x, precision=3)}" for name, x in free)
             raise RuntimeError(
@@ -161,7 +162,7 @@ def _check_computed(problem: Problem, minimum: Minimum) -> None:
     if not np.isfinite(minimum.value):
         raise RuntimeError(
             "the likelihood is not a number where the search begins, at "
-            f"{problem.estimates(minimum.flat)}: give start, a gas nearer to the measured one"
+            f"{problem.to_estimates(minimum.flat)}: give start, a gas nearer to the measured one"
         )
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import scipy
 
 from jaxgran.fitting.comparison import Residuals
-from jaxgran.fitting.problem import Evaluation, Problem
+from jaxgran.fitting.evaluation import Evaluation
+from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.rows import SCATTER
 
 SIGNIFICANCE = 0.005

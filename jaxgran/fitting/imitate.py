@@ -1,5 +1,6 @@
 """Imitations of a measurement: runs of the fitted scene by particles, each of them fitted."""
 
+import warnings
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -60,7 +61,8 @@ class Imitation:
         low, high: ends of the 95 % range in each fitted run, SI, shape (runs,); nan without one.
         estimate, error: estimate and standard error "assuming no other effect", shape (runs,).
         grades: of the fits, see `jaxgran.Fit`.
-        strongest: imitations with the strongest alternative as the truth; None without one.
+        strongest: imitations with the strongest alternative as the truth; None without one, or if
+            they were interrupted before the first fit.
 
     >>> small = dataclasses.replace(measurement, num_particles=50)
     >>> imitation = jaxgran.imitate(jaxgran.fit(small), runs=2, progress=False)
@@ -152,7 +154,8 @@ def imitate(
         progress: show a progress bar on a terminal.
 
     Returns:
-        `Imitation`. Ctrl-C ends it early, with the runs that were fitted.
+        `Imitation`. Ctrl-C ends it early, with the runs that were fitted; a warning says if these
+        are runs of the fitted scene alone.
 
     Raises:
         ValueError: for a fit of several measurements or without N, more than 5e6 grains in all, or
@@ -170,15 +173,19 @@ def imitate(
     measurement = _at_the_estimate(result)
     key = checked_key(key)
     key = jax.random.key(0) if key is None else key
-    imitated = partial(_imitated, result=result, runs=runs, model=model, progress=progress)
+    imitate_truth = partial(
+        _imitate_truth, result=result, runs=runs, model=model, progress=progress
+    )
     strongest = strongest_effect(result)
-    found = imitated(AS_GIVEN, measurement, key=key)
+    found = imitate_truth(AS_GIVEN, measurement, key=key)
     if strongest is None or found.runs < runs:
         return found
     beside = replace(measurement, gas=measurement.gas.replace(**strongest.values))
     try:
-        other = imitated(strongest.truth, beside, key=jax.random.fold_in(key, 1))
+        other = imitate_truth(strongest.truth, beside, key=jax.random.fold_in(key, 1))
     except KeyboardInterrupt:
+        text = f'interrupted before an imitation "{strongest.truth.name}" was fitted'
+        warnings.warn(f"{text}: the result holds those of the fitted scene alone", stacklevel=2)
         return found
     return replace(found, strongest=other)
 
@@ -223,7 +230,7 @@ def _at_the_estimate(result: Fit) -> Measurement:
     return replace(with_errors_that_count(fitted), ensemble_start=False)
 
 
-def _imitated(
+def _imitate_truth(
     truth: Truth,
     measurement: Measurement,
     *,
@@ -235,30 +242,55 @@ def _imitated(
 ) -> Imitation:
     """Return fits of runs of a truth, with the measurement at its values."""
     gas = truth.gas(measurement.gas)
-    since_start = _times_since_start(measurement, result)
+    times = _times_since_start(measurement, result)
     if model is None:
-        model = _particle_model(truth, gas, since_start, measurement.num_particles)
-    of_start, of_errors = jax.random.split(key)
-    several: Any = replace(model, replicas=runs * measurement.replicas)  # of particles
-    curve = cool(gas, since_start, model=several, key=of_start, progress=progress)
+        model = _particle_model(truth, gas, times, measurement.num_particles)
+    of_runs, of_errors = jax.random.split(key)
+    curve = _simulate(model, gas, times, runs * measurement.replicas, of_runs, progress)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(of_errors)))
-    twins = imitations(measurement, result, curve, runs, rng)
-    fits = _fits(twins, _theory_of(model), result.names, progress)
+    measured = imitations(measurement, result, curve, runs, rng)
+    fits = _fits(measured, _theory_of(model), result.names, progress)
     name = result.names[0]
-    ranges = [found.ranges.get(name, (np.nan, np.nan)) for found in fits]
-    values = [found.value(name) for found in fits]
     return Imitation(
         truth=truth.name,
         parameter=name,
         value=float(np.ravel(measurement.gas.value(name))[0]),
         model_name=model.name,
         asked=runs,
-        low=_first_elements([low for low, _ in ranges]),
-        high=_first_elements([high for _, high in ranges]),
-        estimate=_first_elements([estimate for estimate, _ in values]),
-        error=_first_elements([error for _, error in values]),
         grades=tuple(found.grade for found in fits),
+        **_ranges_and_estimates(fits, name),
     )
+
+
+def _simulate(
+    model: AbstractModel,
+    gas: Gas,
+    times: Float[Array, "times"],
+    replicas: int,
+    key: PRNGKeyArray,
+    progress: bool,
+) -> CoolingCurve:
+    """Return the curve of many replicas of a particle model."""
+    of_particles: Any = model
+    several = replace(of_particles, replicas=replicas)
+    return cool(gas, times, model=several, key=key, progress=progress)
+
+
+def _ranges_and_estimates(fits: list[Fit], name: str) -> dict[str, Any]:
+    """Return the ranges and estimates of a parameter, by their names in an `Imitation`."""
+    unknown = np.nan, np.nan
+    ranges = [found.ranges.get(name, unknown) for found in fits]
+    values = [found.value(name) for found in fits]
+    return {
+        "low": _first_elements([low for low, _ in ranges]),
+        "high": _first_elements([high for _, high in ranges]),
+        "estimate": _first_elements([estimate for estimate, _ in values]),
+        "error": _first_elements([error for _, error in values]),
+    }
+
+
+def _first_elements(values: list[Any]) -> Float[np.ndarray, "runs"]:
+    return np.array([np.ravel(value)[0] for value in values])
 
 
 def _particle_model(
@@ -309,7 +341,3 @@ def _fits(
             if not fits:
                 raise
     return fits
-
-
-def _first_elements(values: list[Any]) -> Float[np.ndarray, "runs"]:
-    return np.array([np.ravel(value)[0] for value in values])

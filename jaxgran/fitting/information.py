@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxgran.fitting.comparison import Residuals
-from jaxgran.fitting.problem import Evaluation, Problem
+from jaxgran.fitting.evaluation import Evaluation
+from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.rows import FEW_PARTICLES, MEASUREMENT, MODEL, SAMPLING, SCATTER, SIMULATION
 from jaxgran.fitting.search import Minimum, Solution
 from jaxgran.scene.laws import RestitutionLaw
@@ -131,7 +132,8 @@ def covariance_of_minima(solution: Solution, covariance: np.ndarray) -> np.ndarr
     for m in sorted(minima, key=lambda minimum: minimum.value):
         if min(_distance(m, other, error) for other in kept) > 1:
             kept.append(m)
-    distance = np.stack([problem.estimates(m.flat) - problem.estimates(best.flat) for m in kept])
+    estimate = problem.to_estimates(best.flat)
+    distance = np.stack([problem.to_estimates(m.flat) - estimate for m in kept])
     weights = np.exp([(best.value - m.value) / 2 for m in kept])
     return np.einsum("k,ki,kj->ij", weights / np.sum(weights), distance, distance)
 
@@ -148,7 +150,7 @@ def equally_good_minima(solution: Solution, covariance: np.ndarray) -> np.ndarra
     for m in minima:
         is_deep = m.value < best.value + DEGENERATE
         is_apart = _distance(m, best, error) > DEGENERATE**0.5
-        estimate = problem.estimates(m.flat)
+        estimate = problem.to_estimates(m.flat)
         is_known = any(np.allclose(estimate, other, rtol=1e-3) for other in estimates)
         if is_deep and is_apart and not is_known:
             estimates.append(estimate)
@@ -173,7 +175,7 @@ def weights_of_measurements(problem: Problem, found: Evaluation) -> dict[str, np
     p = problem.num_free
     parts = {m.label: np.zeros(p) for m in problem.measurements}
     for row in found.rows:
-        if not row.is_prior and row.label is not None:
+        if not row.is_prior:
             parts[row.label] = parts[row.label] + np.diag(row.information)[:p]
     whole = np.maximum(np.sum(list(parts.values()), axis=0), np.finfo(float).tiny)
     return {label: part / whole for label, part in parts.items()}
@@ -196,7 +198,7 @@ def undetermined(problem: Problem, found: Evaluation) -> tuple[str, ...]:
     size = np.maximum(np.linalg.norm(sensitivity, axis=0), np.finfo(float).tiny)
     _, singular, axes = np.linalg.svd(sensitivity / size, full_matrices=False)
     is_weak |= _take_part(axes[singular <= problem.model.derivative_accuracy * singular[0]])
-    titles = problem.per_element([u.title for u in problem.unknowns])[:p]
+    titles = problem.repeat_per_element([u.title for u in problem.unknowns])[:p]
     left_out = _exempt_parameters(problem.measurements[0].scene.law)
     return tuple(dict.fromkeys(str(x) for x in titles[is_weak] if x not in left_out))
 

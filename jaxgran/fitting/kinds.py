@@ -283,7 +283,7 @@ def kinds_of(problem: Problem, flat: np.ndarray) -> list[Kind]:
 
 def _is_open(kind: Kind, problem: Problem, rows: CurveRows) -> bool:
     """Tell whether a curve may have what an alternative adds, without its file saying so."""
-    unknowns = {u.name for u in problem.unknowns if u.label in (None, rows.label)}
+    unknowns = {u.name for u in problem.unknowns if u.applies_to(rows.label)}
     absent = {DECLARABLE[name].parameter for name in rows.measurement.absent}
     described = unknowns | absent | {*rows.scene.domains}
     # Spheres of unequal sizes have neither walls nor roughness.
@@ -296,7 +296,7 @@ def _is_open(kind: Kind, problem: Problem, rows: CurveRows) -> bool:
 
 
 def _fitted_curves(problem: Problem, flat: np.ndarray) -> dict[str, FittedCurve]:
-    values = problem.values(flat)
+    values = problem.unflatten(flat)
     computed = problem.evaluate(flat).curves
     curves = {}
     for m in problem.curves:

@@ -52,8 +52,8 @@ def describe_outliers(problem: Problem, first: np.ndarray, max_steps: int) -> It
         time = times[value.label][value.time]
         places.append(f"{prefix_of(value.label)}t = {time:.3g} s (row {value.time + 1})")
     symbol = symbol_of(problem.unknowns[0].name)
-    estimate = rest.estimates(end.flat)[0]
-    error = np.sqrt(inverse(found.information)[0, 0]) * rest.slopes(end.flat)[0]
+    estimate = rest.to_estimates(end.flat)[0]
+    error = np.sqrt(inverse(found.information)[0, 0]) * rest.compute_slopes(end.flat)[0]
     yield (
         f"far outliers at {', '.join(places)}: check them and their error bars; without them "
         f"{symbol} is {estimate:.3g} +- {error:.2g}"
@@ -104,7 +104,7 @@ def _worst(problem: Problem, flat: np.ndarray) -> tuple[Value, float]:
     """Return the value of the largest residual, and the residual over its standard deviation."""
     found = (Value("", 0, 0), 0.0)
     for row in problem.evaluate(flat).rows:
-        if row.name == "curve" and row.label is not None:
+        if row.name == "curve":
             sizes = np.abs(row.values)
             place = int(np.argmax(sizes))
             column, time = divmod(place, sizes.size // 2)

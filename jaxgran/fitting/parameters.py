@@ -22,7 +22,8 @@ LAW = "law"
 """Name that stands for all parameters of the law of restitution."""
 
 SHARED = ""
-"""Label of the priors of parameters that all measurements share, and of a single measurement."""
+"""Label of what all measurements share: unknowns, priors and residuals. It is the label of a single
+measurement, too."""
 
 SMOOTHNESS = "smoothness"
 """Name of the prior that a law of restitution brings."""
@@ -33,14 +34,14 @@ class Unknown(NamedTuple):
 
     Attributes:
         name: of a parameter of the gas, `START_TIME`, or of a nuisance parameter.
-        label: of the measurement that it belongs to; None if all share it.
+        label: of the measurement that it belongs to, or `SHARED`.
         shape: of its value.
         domain: its range, which gives its unconstrained scale.
         unit: of the unconstrained scale of a parameter with an infinite range.
     """
 
     name: str
-    label: str | None
+    label: str
     shape: tuple[int, ...]
     domain: Domain
     unit: ArrayLike = 1.0
@@ -53,7 +54,11 @@ class Unknown(NamedTuple):
     @property
     def title(self) -> str:
         """Name in a `Fit`, which begins with a label for a parameter of one measurement."""
-        return self.name if not self.label else f"{self.label}: {self.name}"
+        return self.name if self.label == SHARED else f"{self.label}: {self.name}"
+
+    def applies_to(self, label: str) -> bool:
+        """Tell whether it is an unknown of the measurement with a label."""
+        return self.label in (SHARED, label)
 
 
 def domain_of(gas: Gas, name: str) -> Domain:

@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxgran.data.measurement import START_TIME
 from jaxgran.fitting.guesses import power_of_line
-from jaxgran.fitting.parameters import as_floats, with_values
+from jaxgran.fitting.parameters import SHARED, as_floats, with_values
 from jaxgran.fitting.rows import CALIBRATION, FLOOR, ROTATION, SCATTER, WHITE, CurveRows
 from jaxgran.fitting.time_grid import TimeGrid, shift_with_t0, time_grid
 from jaxgran.models.base import AbstractModel
@@ -46,14 +46,14 @@ class Element(NamedTuple):
     """
 
     name: str
-    label: str | None
+    label: str
     number: int
     place: int
     slope: float
 
     def applies_to(self, label: str) -> bool:
         """Tell whether it is an unknown of the measurement with a label."""
-        return self.label is None or self.label == label
+        return self.label in (SHARED, label)
 
 
 class Prediction(NamedTuple):

@@ -133,7 +133,7 @@ class _Profile:
         """Fit all unknowns with an amplitude, from a first guess; None if this fails."""
         added = self.kind.values_by_label(self.problem, amplitude)
         wider = self.kind.with_wider_rate_errors(self.problem, amplitude)
-        fixed = self.problem.fixed_with(added)
+        fixed = self.problem.extend_fixed(added)
         return trial_of(replace(wider, fixed=fixed), amplitude, first, self.origin)
 
     def fit_sequence(self, amplitudes: Iterable[float], lowest: float) -> list[Trial]:

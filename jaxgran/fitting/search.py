@@ -12,7 +12,8 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
-from jaxgran.fitting.problem import Evaluation, Problem
+from jaxgran.fitting.evaluation import Evaluation
+from jaxgran.fitting.problem import Problem
 
 LAST_STEP = 0.01
 """A search ends where the next Newton step is shorter than this, in standard errors."""
@@ -146,7 +147,7 @@ class Objective:
     def nearest(self, flat: Float[np.ndarray, "unknowns"]) -> Float[np.ndarray, "unknowns"]:
         """Return the nearest unknowns in this region."""
         limits = [MAX_DISTANCE.get(u.name, MAX_DISTANCE_OF_OTHERS) for u in self.problem.unknowns]
-        farthest = self.problem.per_element(limits)
+        farthest = self.problem.repeat_per_element(limits)
         return np.clip(flat, self.origin - farthest, self.origin + farthest)
 
     def evaluate(self, flat: np.ndarray) -> Evaluation:
@@ -276,7 +277,7 @@ def minima_from_starts(
     domains = {u.name: u.domain for u in problem.unknowns}
     if MULTIMODAL_PARAMETER not in domains:
         return minima
-    names = problem.per_element([u.name for u in problem.unknowns])
+    names = problem.repeat_per_element([u.name for u in problem.unknowns])
     for value in domains[MULTIMODAL_PARAMETER].to_free(np.asarray(MULTIMODAL_STARTS)):
         start = np.where(names == MULTIMODAL_PARAMETER, value, first)
         with contextlib.suppress(RuntimeError):

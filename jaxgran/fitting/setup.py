@@ -78,7 +78,7 @@ def build_problem(request: Request) -> Setup:
     rows, notes = _rows(request)
     problem = Problem.build(rows, request.model, request.names, request.separate, request.priors)
     guesses = _guesses(request, problem)
-    first = problem.flat(_values_of_guesses(problem, guesses))
+    first = problem.flatten(_values_of_guesses(problem, guesses))
     with ThreadPoolExecutor(1) as thread:  # two programs are compiled at the same time
         compiled = thread.submit(_compile_innovations, problem, first, _Configuration.current())
         problem = problem_with_rate_errors(problem, first)
@@ -88,7 +88,7 @@ def build_problem(request: Request) -> Setup:
             label: with_values_of(guess, request.start, request.free)
             for label, guess in guesses.items()
         }
-        first = _better(problem, first, problem.flat(_values_of_guesses(problem, started)))
+        first = _better(problem, first, problem.flatten(_values_of_guesses(problem, started)))
     problem.check_start(first)
     return Setup(problem, first, notes)
 
@@ -173,7 +173,7 @@ def _compile_innovations(problem: Problem, flat: np.ndarray, config: _Configurat
 
 def problem_with_rate_errors(problem: Problem, flat: np.ndarray) -> Problem:
     """Return a problem with the errors of its model's cooling rate at some unknowns."""
-    values = problem.values(flat)
+    values = problem.unflatten(flat)
 
     def with_error(m: CurveRows | DropRows) -> CurveRows | DropRows:
         if isinstance(m, DropRows):
@@ -194,7 +194,7 @@ def _values_of_guesses(problem: Problem, guesses: dict[str, Gas]) -> dict[str, d
     """Return the values of gases and a guess of t0, by label and name."""
     values: dict[str, dict[str, Any]] = {label: gas.parameters for label, gas in guesses.items()}
     for m in problem.curves:
-        names = tuple(u.name for u in problem.unknowns if u.label in (None, m.label))
+        names = tuple(u.name for u in problem.unknowns if u.applies_to(m.label))
         known = known_start_time(problem.priors, m.label)
         values[m.label][START_TIME] = guess_start_time(guesses[m.label], m.curve, names, known)
     return values

@@ -22,7 +22,7 @@ from jaxgran.fitting.rows import (
     SIMULATION,
     SLOPE,
 )
-from jaxgran.fitting.simulations import Search, Simulations, information_by
+from jaxgran.fitting.simulations import SearchResult, Simulations, information_by
 from jaxgran.models.error_model import ErrorModel
 from jaxgran.scene.gas import Gas
 
@@ -55,7 +55,7 @@ class Expansion(NamedTuple):
         return max(self.num_used - self.slopes.shape[1], 1)
 
 
-def expand(sims: Simulations, search: Search) -> Expansion:
+def expand(sims: Simulations, search: SearchResult) -> Expansion:
     """Return the values and slopes of the simulations near an estimate."""
     flat = search.average.flat
     differences = [sims.measured - s.values - s.slope @ (flat - s.flat) for s in search.near]
@@ -87,20 +87,20 @@ class SimulatedEstimate(NamedTuple):
 
     Attributes:
         sims: the simulations and the measurement.
-        search: the search that ended at the estimate.
+        search: where the search ended.
         expansion: of the simulations near the estimate.
         gas: the fitted gas.
     """
 
     sims: Simulations
-    search: Search
+    search: SearchResult
     expansion: Expansion
     gas: Gas
 
     @property
     def scale(self) -> Float[np.ndarray, "p 1"]:
         """Derivatives of the parameters, SI, in the unconstrained ones."""
-        return self.sims.problem.slopes(self.search.average.flat)[:, None]
+        return self.sims.problem.compute_slopes(self.search.average.flat)[:, None]
 
 
 def covariances_of(
@@ -190,7 +190,7 @@ def derivative_bias(estimate: SimulatedEstimate) -> float:
     curve = estimate.search.curve
     bias = curve.derivative_bias
     if bias is None:
-        N = getattr(model, "num_particles", None)
+        N = estimate.sims.num_particles
         error_model = ErrorModel.from_curve(estimate.gas, _from_start(estimate.gas, curve), N)
         since_start = np.broadcast_to(model.derivative_error(error_model), error_model.time.shape)
         bias = since_start[-curve.times.size :]

@@ -132,9 +132,14 @@ class Simulations:
         """The stochastic model."""
         return self.problem.model
 
+    @property
+    def num_particles(self) -> int | None:
+        """N of each simulated gas; None for a model that does not tell it."""
+        return getattr(self.model, "num_particles", None)
+
     def gas_at(self, flat: Any) -> Gas:
         """Return the gas at some parameters, which may be traced."""
-        return with_parameters(self.rows.scene, self.problem.values(flat)[""])
+        return with_parameters(self.rows.scene, self.problem.unflatten(flat)[""])
 
     def curve_at(self, flat: Any, stream: int) -> CoolingCurve:
         """Return the curve of a simulation; each has another stream of random numbers."""
@@ -187,7 +192,7 @@ class Simulations:
 
     def compare_with_theory(self, flat: np.ndarray, rows: CurveRows) -> Comparison:
         """Compare kinetic theory with the measured rows."""
-        values = self.problem.values(flat)[""]
+        values = self.problem.unflatten(flat)[""]
         known = {name: x for name, x in values.items() if name in rows.gas.domains}
         return Comparison(predicted_curve(rows, KineticTheory(), known, []))
 
@@ -195,14 +200,13 @@ class Simulations:
         """Return the measured curve for kinetic theory, with the noise of a mean of simulations.
 
         Simulated grains scatter as measured ones do, but for contacts, which only soft spheres
-        have. Where a model does not know its number of grains, the scatter of its replicas gives
+        have. Where a model does not tell its number of grains, the scatter of its replicas gives
         the noise, independent at each time.
         """
-        number = getattr(self.model, "num_particles", None)
-        if number is None:
+        if self.num_particles is None:
             variance = np.mean([s.variance for s in near], axis=0) / len(near)
             return replace(self.theory, simulation=variance.reshape(2, -1).T)
-        simulated = number * sum(len(s.deviation) for s in near)
+        simulated = self.num_particles * sum(len(s.deviation) for s in near)
         grains = self.theory.grains
         inverse_number = grains.inverse_number + 1 / simulated
         contacts = grains.contacts
@@ -256,14 +260,14 @@ class Simulations:
         """Return the covariance that kinetic theory gives to the estimate of one simulation.
 
         It is the part of the covariance by the scatter of all grains, measured and simulated, times
-        its share of one simulation; None where a model does not know its number.
+        its share of one simulation; None where a model does not tell its number of grains.
         """
-        number = getattr(self.model, "num_particles", None)
-        if number is None:
+        if self.num_particles is None:
             return None
         covariance = resolved_inverse(information, self.model.derivative_accuracy)
         by_grains = covariance @ information_by(comparison, slope, FEW_PARTICLES) @ covariance
-        return by_grains / (comparison.curve.rows.grains.inverse_number * number * replicas)
+        inverse_number = comparison.curve.rows.grains.inverse_number
+        return by_grains / (inverse_number * self.num_particles * replicas)
 
 
 def information_by(
@@ -287,8 +291,8 @@ def variance_of_mean(deviation: Float[np.ndarray, "replicas used"]) -> Float[np.
     return np.convolve(variance, window, "same") / num_averaged
 
 
-class Search(NamedTuple):
-    """Result of a search through simulations.
+class SearchResult(NamedTuple):
+    """Where a search through simulations ended.
 
     Attributes:
         average: the estimate and its errors.
@@ -307,7 +311,7 @@ class Search(NamedTuple):
     trace: Trace | None = None
 
 
-def by_gauss_newton(sims: Simulations, first: np.ndarray, max_simulations: int) -> Search:
+def by_gauss_newton(sims: Simulations, first: np.ndarray, max_simulations: int) -> SearchResult:
     """Search by Gauss-Newton steps, each on one simulation and its derivatives.
 
     Each simulation has different random numbers. The simulations within `AVERAGING_DISTANCE` of the
@@ -337,12 +341,12 @@ def by_gauss_newton(sims: Simulations, first: np.ndarray, max_simulations: int) 
             bar.set_postfix_str(f"last step {in_errors:.2g} standard errors")
             if converged and len(near) > 1 and low_noise:
                 break
-    return Search(average._replace(flat=flat), near, curve, len(simulations), converged)
+    return SearchResult(average._replace(flat=flat), near, curve, len(simulations), converged)
 
 
 def by_descent(
     sims: Simulations, first: np.ndarray, max_simulations: int, descent: Descent
-) -> Search:
+) -> SearchResult:
     """Search by gradient descent.
 
     Each step takes the gradient of |W (y - f)|^2, plus that of the prior, through a simulation with
@@ -365,7 +369,8 @@ def by_descent(
         return Loss(float(value), gradient)
 
     used = int(np.sum(sims.rows.used))
-    course = descent.descend(at, first, max_simulations, used, sims.problem.estimates, noisy=True)
+    to_estimates = sims.problem.to_estimates
+    course = descent.descend(at, first, max_simulations, used, to_estimates, noisy=True)
     flats = course.flats
     averaged = (len(flats) + 1) // 2
     flat = np.mean(flats[-averaged:], axis=0)
@@ -379,4 +384,4 @@ def by_descent(
     noise = average.noise * NUM_LINEARISED / averaged
     average = average._replace(flat=flat, noise=noise)
     num_simulations = len(flats) + NUM_LINEARISED
-    return Search(average, near, runs[-1][1], num_simulations, course.converged, course.trace)
+    return SearchResult(average, near, runs[-1][1], num_simulations, course.converged, course.trace)

@@ -12,11 +12,12 @@ import jaxgran
 from jaxgran._utils.validation import Domain
 from jaxgran.fitting import alternatives, estimate, profiles
 from jaxgran.fitting.alternatives import Alternative, Explanations
+from jaxgran.fitting.evaluation import Evaluation
 from jaxgran.fitting.goodness import Goodness
 from jaxgran.fitting.kinds import KINDS, WALLS_ADDED, FittedCurve
 from jaxgran.fitting.measured_rows import curve_rows
-from jaxgran.fitting.parameters import Unknown
-from jaxgran.fitting.problem import Evaluation, Problem
+from jaxgran.fitting.parameters import SHARED, Unknown
+from jaxgran.fitting.problem import Problem
 from jaxgran.fitting.profiles import Trial
 from jaxgran.fitting.reasons import describe_search
 from jaxgran.fitting.search import MAX_DISTANCE
@@ -337,7 +338,7 @@ def parabola(minimum=0.0, name=A, **changes):
             return Evaluation(value, 2 * distance, np.eye(1), [], {})
 
     theory = jaxgran.KineticTheory()
-    unknowns = (Unknown(name, None, (), Domain()),)
+    unknowns = (Unknown(name, SHARED, (), Domain()),)
     known = {"measurements": (), "model": theory, "simplified_model": theory, "priors": {}}
     return Parabola(**(known | changes), unknowns=unknowns, num_free=1)
 
@@ -353,7 +354,7 @@ def test_a_trial_at_the_edge_of_the_region_has_the_misfit_of_the_edge():
 
 
 def summary_of(problem, base):
-    return alternatives._Summary(problem, base, base, significant=10.0, noise=np.zeros(1))
+    return alternatives._Summary(problem, base, base, significant=10.0, further_errors=np.zeros(1))
 
 
 def test_a_widening_is_compared_with_1_where_the_estimate_is_0():

@@ -10,6 +10,7 @@ import jaxgran
 from jaxgran.fitting import imitate as module
 from jaxgran.fitting.drawn_errors import imitations
 from jaxgran.fitting.measured_rows import with_errors_that_count
+from jaxgran.fitting.twins import StrongestEffect, Truth
 from tests.beads import glass_beads
 
 TIMES = np.geomspace(0.1, 10.0, 10)
@@ -131,6 +132,26 @@ def test_interrupted_imitations_give_what_they_have(monkeypatch):
     assert found.strongest is None
     assert found.width == pytest.approx(np.median((found.high - found.low) / found.value), rel=1e-2)
     assert "interrupted" in repr(found)
+
+
+@pytest.mark.slow
+def test_an_interruption_before_the_strongest_alternative_is_fitted_is_reported(monkeypatch):
+    result = jaxgran.fit(planned(), quick=True)
+    truth = Truth("with drag", effect="drag", elements={"drag": jaxgran.StokesDrag(0.01)})
+    simulated = []
+
+    def interrupted(*arguments, **options):
+        if simulated:
+            raise KeyboardInterrupt
+        simulated.append(jaxgran.cool(*arguments, **options))
+        return simulated[-1]
+
+    monkeypatch.setattr(module, "strongest_effect", lambda result: StrongestEffect(truth, {}))
+    monkeypatch.setattr(module, "cool", interrupted)
+    monkeypatch.setattr(module, "fit", lambda measurement, **options: result)
+    with pytest.warns(UserWarning, match='before an imitation "with drag" was fitted'):
+        found = jaxgran.imitate(result, 2, progress=False)
+    assert found.runs == found.asked == 2 and found.strongest is None
 
 
 @pytest.mark.slow

@@ -226,5 +226,5 @@ def test_a_second_effect_of_one_curve_keeps_the_first_one_of_the_others():
     problem, _, _ = build_problem(request)
     known = {label: {"wall_coefficient": 0.5} for label in measurements}
     problem = dataclasses.replace(problem, fixed=known)
-    both = problem.fixed_with({"a": {"drag_rate": 0.1}})
+    both = problem.extend_fixed({"a": {"drag_rate": 0.1}})
     assert both["a"] == {"wall_coefficient": 0.5, "drag_rate": 0.1} and both["b"] == known["b"]
