@@ -32,7 +32,7 @@ def covariance_of_positions():
     return np.array([[element(min(s, t), max(s, t)) for t in FRAMES] for s in FRAMES])
 
 
-def steps_with(covariance, n=4000):
+def steps_with(covariance, n):
     """Steps of n particles in one dimension, whose displacements have exactly this covariance."""
     rng = np.random.default_rng(0)
     numbers = rng.standard_normal((n, len(covariance)))
@@ -45,12 +45,12 @@ def steps_with(covariance, n=4000):
     return [Step(float(t), float(dt), np.arange(n), x[:, None]) for t, dt, x in rows]
 
 
-def made_steps(error=0.0):
+def made_steps(error=0.0, n=4000):
     """Steps with a known memory, and T by their displacements."""
     positions = covariance_of_positions() + error**2 * np.eye(len(FRAMES))
     difference = np.diff(np.eye(len(FRAMES)), axis=0)
     covariance = difference @ positions @ difference.T
-    return steps_with(covariance), np.diag(covariance) / np.diff(FRAMES) ** 2
+    return steps_with(covariance, n), np.diag(covariance) / np.diff(FRAMES) ** 2
 
 
 @pytest.mark.parametrize("x", [1e-6, 1e-3, 0.3, 5.0, 100.0])
@@ -94,6 +94,13 @@ def test_the_rate_is_compared_with_theory():
     assert memory.rate_ratio == pytest.approx(memory.rate / expected, rel=1e-12)
     # 4000 particles know the rate better than theory, whose error is 20 %: it hardly moves.
     assert memory.rate_ratio == pytest.approx(0.5, rel=0.05)
+
+
+def test_few_particles_leave_the_rate_near_theory():
+    expected = 2 * NU_V / T**0.5
+    few = fit_memory(*made_steps(n=8), expected, 0.0).rate_ratio
+    more = fit_memory(*made_steps(n=80), expected, 0.0).rate_ratio
+    assert 0.5 < more < few < 1
 
 
 def test_particles_in_free_flight_have_no_memory_of_impacts():
