@@ -57,7 +57,6 @@ from jaxgran.scene.contact import impact as impact
 from jaxgran.scene.elements import Frictional as Frictional
 from jaxgran.scene.elements import Rough as Rough
 from jaxgran.scene.elements import StokesDrag as StokesDrag
-from jaxgran.scene.elements import Walls as Walls
 from jaxgran.scene.elements import WhiteNoise as WhiteNoise
 from jaxgran.scene.gas import Gas as Gas
 from jaxgran.scene.geometry import sphere_mass as sphere_mass
@@ -66,6 +65,7 @@ from jaxgran.scene.laws import RestitutionSeries as RestitutionSeries
 from jaxgran.scene.laws import RestitutionSpline as RestitutionSpline
 from jaxgran.scene.laws import Viscoelastic as Viscoelastic
 from jaxgran.scene.laws import viscoelastic_restitution as viscoelastic_restitution
+from jaxgran.scene.walls import Walls as Walls
 from jaxgran.sweeps import sweep as sweep
 from jaxgran.theory.steady_states import SteadyState as SteadyState
 from jaxgran.theory.steady_states import steady_state as steady_state

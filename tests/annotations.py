@@ -19,9 +19,9 @@ UNCHECKED = {
     "models.spheres": {"AbstractSpheres.sized_for"},
     "particles.observables": {"pair_correlation"},
     "particles.start": {"check_start"},
-    "scene.elements": {"_wall_law"},
     "scene.gas": {"Gas.replace", "Gas.restitution", "_checked_law"},
     "scene.geometry": {"sphere_mass"},
+    "scene.walls": {"_wall_law"},
     "sweeps": {"sweep"},
 }
 """Functions, by module, that check their arguments themselves and raise clearer errors."""

@@ -13,8 +13,8 @@ from jaxgran.data.header import gas_of_header
 from jaxgran.data.header_values import header_count, header_number
 from jaxgran.data.measurement_header import guesses_of_header
 from jaxgran.data.scene_file import Experiment, read_scene_file
-from jaxgran.scene.elements import container_volume_ratio
 from jaxgran.scene.parameters import symbol_of
+from jaxgran.scene.walls import container_volume_ratio
 
 NUM_POINTS = 50
 """Number of times of a curve that is computed for --until."""

@@ -18,11 +18,11 @@ from jaxgran.data.header_keys import (
 from jaxgran.data.header_values import header_dimension, header_number, header_sides
 from jaxgran.data.units import UNIT_KEYS
 from jaxgran.data.usual_values import ask_about_header
-from jaxgran.scene.elements import VOLUME_TOLERANCE, container_volume_ratio
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import sphere_mass
 from jaxgran.scene.laws import ConstantRestitution, RestitutionLaw, Viscoelastic
 from jaxgran.scene.parameters import BY_SYMBOL, REQUIRED
+from jaxgran.scene.walls import VOLUME_TOLERANCE, container_volume_ratio
 
 MAX_DIFFERENCE = 0.01
 """Relative difference of a value in a header to the one that is used, above which is asked."""

@@ -5,9 +5,10 @@ from typing import Any
 
 from jaxgran.data.header_keys import GUESS, GUESSES, UNSUPPORTED_KEYS
 from jaxgran.data.header_values import header_number, header_sides
-from jaxgran.scene.elements import Frictional, Rough, Walls
+from jaxgran.scene.elements import Frictional, Rough
 from jaxgran.scene.gas import ELEMENTS
 from jaxgran.scene.parameters import fields_of
+from jaxgran.scene.walls import Walls
 
 
 def elements_of_header(header: dict[str, str]) -> dict[str, Any]:

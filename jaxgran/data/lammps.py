@@ -6,9 +6,10 @@ from itertools import combinations_with_replacement
 import numpy as np
 
 from jaxgran._utils.validation import POSITIVE
-from jaxgran.scene.elements import Frictional, Rough, Walls
+from jaxgran.scene.elements import Frictional, Rough
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.laws import Viscoelastic
+from jaxgran.scene.walls import Walls
 
 STEPS_OF_CONTACT = 100
 """Time steps in the mean duration of a contact: eps is then right to 1e-3."""

@@ -13,7 +13,7 @@ from jaxgran.data.curve_checks import check_values
 from jaxgran.data.displacements import CHANCE, MIN_TRACKS, Step, steps_of_tracks
 from jaxgran.data.header_values import header_count, header_dimension, header_number
 from jaxgran.data.track_positions import identities_of
-from jaxgran.data.velocity_memory import NUM_ITERATIONS, Memory, displacement_factor, fit_memory
+from jaxgran.data.velocity_memory import Memory, fit_memory, free_flight_squares
 from jaxgran.scene.gas import Gas
 
 MAX_CORRECTION = 0.3
@@ -299,9 +299,7 @@ def _without_impacts(
     if rate == 0:
         remarks.notes.append("impacts between frames not corrected (the velocities show none)")
         return T
-    true = T
-    for _ in range(NUM_ITERATIONS):
-        true = T / displacement_factor(rate * duration * np.sqrt(true))
+    true = free_flight_squares(T, rate * duration)
     share = float(np.max(1 - T / true))
     remarks.notes.append(f"impacts between frames corrected, at most {100 * share:.2g} % of T")
     if share > MAX_CORRECTION:

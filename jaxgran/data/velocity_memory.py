@@ -1,4 +1,8 @@
-"""How fast tracked particles forget their velocities, from correlations of their displacements."""
+"""How fast tracked particles forget their velocities, from correlations of their displacements.
+
+Impacts between two frames bend the paths, so that particles get less far than in free flight. The
+velocity autocorrelation is taken to be ``exp(-nu_v t)``.
+"""
 
 from typing import NamedTuple
 
@@ -9,7 +13,13 @@ from jaxtyping import Float, Int
 from jaxgran.data.displacements import MIN_TRACKS, Step
 
 NUM_ITERATIONS = 50
-"""Iterations for T from the displacements, each of which reduces the error by 2 or more."""
+"""Iterations of `free_flight_squares`, each of which reduces the error by 2 or more."""
+
+MIN_FREE_SHARE = 1e-3
+"""Least share of a mean square displacement that a fit leaves after errors of the positions."""
+
+TOUCHING = 1e-6
+"""Gap of two intervals, over the duration of the first, below which they share a frame."""
 
 MIN_SIGMAS = 5.0
 """Least significance of what the displacements show, the errors of which are correlated."""
@@ -41,11 +51,13 @@ def fit_memory(
 ) -> Memory:
     """Return how fast the velocities are forgotten.
 
-    With the velocity autocorrelation ``exp(-nu_v t)`` and an error e of the positions
+    Displacements in the intervals k and l have the mean squares s_k and s_l in free flight, last
+    x_k and x_l relaxation times, and have errors e of the positions:
 
-        <dx_k^2> = T f_k + 2 e^2,    <dx_k dx_l> = T h_k h_l exp(-nu_v gap) - e^2 (if they touch),
+        <dx_k^2> = s_k f(x_k) + 2 e^2,
+        <dx_k dx_l> = sqrt(s_k s_l) g(x_k) g(x_l) exp(-nu_v gap) - e^2 (if they touch),
 
-    where f and h are integrals over the intervals and gap is the time between these.
+    with `displacement_factor` f, ``g(x) = (1 - exp(-x))/x``, and the time between them as gap.
 
     Args:
         steps: displacements of at least `MIN_TRACKS` particles each.
@@ -54,70 +66,65 @@ def fit_memory(
             `ENSKOG_ERROR`; None if the gas is not known.
         localisation_error: e, m; None if it is to be estimated.
     """
-    pairs = _correlations(steps)
+    pairs = _measured_correlations(steps)
     if not (np.all(T > 0) and len(pairs.correlation)):
         return Memory(enskog or 0.0)
-    time = np.array([step.time for step in steps])
     duration = np.array([step.duration for step in steps])
-    i = pairs.first
-    j = pairs.second
-    D = T * duration**2
-    unit = float(np.median(D))
-    gap = np.maximum(time[j] - time[i] - (duration[j] + duration[i]) / 2, 0.0)
-    touch = gap < 1e-6 * duration[i]
-    prior = None if enskog is None else enskog * unit**0.5
-    known_square = (localisation_error or 0.0) ** 2 / unit
+    squares = T * duration**2
+    unit = float(np.median(squares))
+    # Lengths in the fit are in sqrt(unit), so that its parameters are of the order of 1.
+    expected_rate = None if enskog is None else enskog * unit**0.5
+    given_error_square = (localisation_error or 0.0) ** 2 / unit
 
     def residuals(parameters: np.ndarray) -> np.ndarray:
         rate = parameters[0]
-        square = parameters[1] if len(parameters) > 1 else known_square
-        moved = np.maximum(D / unit - 2 * square, 1e-3)
-        x = rate * np.sqrt(moved)
-        for _ in range(NUM_ITERATIONS):
-            x = rate * np.sqrt(moved / displacement_factor(x))
-        h = np.sqrt(moved / displacement_factor(x)) * scipy.special.exprel(-x)
-        decay = np.exp(-gap * np.sqrt(x[i] / duration[i] * x[j] / duration[j]))
-        model = unit * (h[i] * h[j] * decay - square * touch) / np.sqrt(D[i] * D[j])
-        known = [] if prior is None else [(rate / prior - 1) / ENSKOG_ERROR]
-        return np.concatenate([pairs.weight * (pairs.correlation - model), known])
+        error_square = parameters[1] if len(parameters) > 1 else given_error_square
+        model = _model_correlations(pairs, squares, duration, unit, rate, error_square)
+        misfit = pairs.weight * (pairs.correlation - model)
+        if expected_rate is None:
+            return misfit
+        return np.append(misfit, (rate / expected_rate - 1) / ENSKOG_ERROR)
 
     def fit(start: list[float], high: list[float]) -> tuple[np.ndarray, np.ndarray]:
         found = scipy.optimize.least_squares(residuals, start, bounds=([0.0] * len(start), high))
         return found.x, np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac)))
 
-    first = prior or 0.1
-    highest = max(20.0, 2 * first)
-    found, error = fit([first], [highest])
+    first_rate = expected_rate or 0.1
+    max_rate = max(20.0, 2 * first_rate)  # far above what displacements can show
+    found, error = fit([first_rate], [max_rate])
     estimated = None
     if localisation_error is None:
-        both, errors = fit([first, 0.05], [highest, 0.49])
+        # 2 e^2 is at most the whole of a mean square displacement.
+        both, errors = fit([first_rate, 0.05], [max_rate, 0.49])
         if both[1] > MIN_SIGMAS * errors[1]:
             found = both
             error = errors
             estimated = float(np.sqrt(both[1] * unit))
-    if prior is None and found[0] < MIN_SIGMAS * error[0]:
+    if expected_rate is None and found[0] < MIN_SIGMAS * error[0]:
         return Memory(0.0, estimated)
-    ratio = None if prior is None else found[0] / prior
+    ratio = None if expected_rate is None else found[0] / expected_rate
     return Memory(found[0] / unit**0.5, estimated, ratio)
 
 
 class _Correlations(NamedTuple):
-    """Correlations of the displacements in two steps.
+    """Correlations of the displacements in two intervals.
 
     Attributes:
-        first: index of the first step.
+        first: index of the first interval.
         second: index of the second one.
+        gap: time from the end of the first to the start of the second, s.
         correlation: of the displacements of the particles in both.
         weight: inverse of its error.
     """
 
     first: Int[np.ndarray, "pairs"]
     second: Int[np.ndarray, "pairs"]
+    gap: Float[np.ndarray, "pairs"]
     correlation: Float[np.ndarray, "pairs"]
     weight: Float[np.ndarray, "pairs"]
 
 
-def _correlations(steps: list[Step]) -> _Correlations:
+def _measured_correlations(steps: list[Step]) -> _Correlations:
     """Return the correlations of neighbouring steps, and of those with one step between."""
     rows = []
     for lag in (1, 2):
@@ -125,11 +132,65 @@ def _correlations(steps: list[Step]) -> _Correlations:
             _, i, j = np.intersect1d(one.ids, two.ids, assume_unique=True, return_indices=True)
             if len(i) < MIN_TRACKS:
                 continue
-            a, b = (x - x.mean(axis=0) for x in (one.displacement[i], two.displacement[j]))
+            a = _centred(one.displacement[i])
+            b = _centred(two.displacement[j])
+            gap = two.time - one.time - (two.duration + one.duration) / 2
             correlation = np.sum(a * b) / np.sqrt(np.sum(a**2) * np.sum(b**2))
-            rows.append((k, k + lag, correlation, np.sqrt(a.size)))
-    first, second, correlation, weight = np.array(rows).reshape(-1, 4).T
-    return _Correlations(first.astype(int), second.astype(int), correlation, weight)
+            rows.append((k, k + lag, max(gap, 0.0), correlation, np.sqrt(a.size)))
+    first, second, gap, correlation, weight = np.array(rows).reshape(-1, 5).T
+    return _Correlations(first.astype(int), second.astype(int), gap, correlation, weight)
+
+
+def _centred(displacement: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
+    return displacement - displacement.mean(axis=0)
+
+
+def _model_correlations(
+    pairs: _Correlations,
+    squares: Float[np.ndarray, "steps"],
+    duration: Float[np.ndarray, "steps"],
+    unit: float,
+    rate: float,
+    error_square: float,
+) -> Float[np.ndarray, "pairs"]:
+    """Return the correlations of `fit_memory` at a rate and an error of the positions.
+
+    Args:
+        pairs: the intervals.
+        squares: mean square of one component of the displacements in each interval, m^2.
+        duration: of each interval, s.
+        unit: square of the unit of length of the fit, m^2.
+        rate: nu_v/sqrt(T) times the unit of length.
+        error_square: e^2 over the unit.
+    """
+    i = pairs.first
+    j = pairs.second
+    without_error = np.maximum(squares / unit - 2 * error_square, MIN_FREE_SHARE)
+    relaxations = rate * np.sqrt(free_flight_squares(without_error, rate))
+    free_flight = np.sqrt(without_error / displacement_factor(relaxations))
+    moved = free_flight * scipy.special.exprel(-relaxations)
+    nu_v_square = relaxations[i] / duration[i] * relaxations[j] / duration[j]
+    decay = np.exp(-pairs.gap * np.sqrt(nu_v_square))
+    touch = pairs.gap < TOUCHING * duration[i]
+    covariance = moved[i] * moved[j] * decay - error_square * touch
+    return unit * covariance / np.sqrt(squares[i] * squares[j])
+
+
+def free_flight_squares(
+    squares: Float[np.ndarray, "steps"], rate: float | Float[np.ndarray, "steps"]
+) -> Float[np.ndarray, "steps"]:
+    """Return the mean squares s that displacements would have without impacts between the frames.
+
+    They solve ``squares = s f(rate sqrt(s))`` with `displacement_factor` f.
+
+    Args:
+        squares: mean square of one component of the displacements, in any unit.
+        rate: relaxation times in a displacement of unit length in free flight.
+    """
+    free = squares
+    for _ in range(NUM_ITERATIONS):
+        free = squares / displacement_factor(rate * np.sqrt(free))
+    return free
 
 
 def displacement_factor(x: Float[np.ndarray, "times"]) -> Float[np.ndarray, "times"]:

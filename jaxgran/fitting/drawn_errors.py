@@ -9,7 +9,7 @@ from jaxtyping import Float
 from jaxgran._utils.tracing import as_jax_arrays
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.data.measurement import DENSITY, START_TIME, Measurement, Priors, prior_domain
-from jaxgran.fitting.kalman import SAMPLE_MEMORY
+from jaxgran.fitting.kalman import SAMPLE_DECAY_RATE
 from jaxgran.fitting.measured_rows import sampling_variance
 from jaxgran.fitting.result import Fit
 from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
@@ -79,7 +79,7 @@ def _sampling_errors(
         return np.zeros(shape)
     collisions = np.asarray(curve.collisions)
     distance = np.abs(collisions[:, None] - collisions[None])
-    correlation = np.exp(-SAMPLE_MEMORY * distance) + 1e-9 * np.eye(collisions.size)
+    correlation = np.exp(-SAMPLE_DECAY_RATE * distance) + 1e-9 * np.eye(collisions.size)
     return variance**0.5 * rng.normal(size=shape) @ np.linalg.cholesky(correlation).T
 
 

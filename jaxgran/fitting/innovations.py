@@ -22,7 +22,7 @@ LOG_RATIO_FROM = 0.5
 class Innovations(NamedTuple):
     """Residuals of measured values minus what is expected from all values before them.
 
-    In their first form all arrays have the shape (nodes, 2, gases).
+    `innovations` returns arrays of the shape (nodes, 2, gases).
 
     Attributes:
         values: innovations of T and of T_rot, relative; 0 where nothing is used.
@@ -54,12 +54,10 @@ def innovations(
     """
     values = observed.values[..., None]
     errors = observed.errors[..., None]
-    residuals = log_ratio(values, log_computed, errors)
+    column = log_ratio(values, log_computed, errors)[:, :, None]
     variances = (errors / jnp.exp(log_computed)) ** 2 + observed.simulation[..., None]
-    variances = variances.at[:, 0].add(noise.white[None] ** 2)
-    found = filtered(
-        gas, nodes, residuals[:, :, None], variances, sensitivity, observed.used, noise
-    )
+    variances = variances.at[:, 0].add(noise.white[None] ** 2)  # of T alone
+    found = filtered(gas, nodes, column, variances, sensitivity, observed.used, noise)
     changes = log_density_change(values, log_computed, errors)
     return Innovations(found.values[:, :, 0], found.variances, changes)
 
@@ -74,9 +72,9 @@ def log_ratio(values: Array, log_computed: Array, errors: Array) -> Array:
     """
     ratio = values / jnp.exp(log_computed)
     # Continued to small and negative ratios by its tangent.
-    above = ratio > LOG_RATIO_FROM
     tangent = jnp.log(LOG_RATIO_FROM) + ratio / LOG_RATIO_FROM - 1
-    log = jnp.where(above, jnp.log(jnp.maximum(ratio, LOG_RATIO_FROM)), tangent)
+    log = jnp.log(jnp.maximum(ratio, LOG_RATIO_FROM))
+    log = jnp.where(ratio > LOG_RATIO_FROM, log, tangent)
     share = _share_of_log(log_computed, errors)
     return jnp.where(share < 1, share * log + (1 - share) * (ratio - 1), log)
 
@@ -91,9 +89,9 @@ def log_density_change(values: Array, log_computed: Array, errors: Array) -> Arr
     ratio = values / jnp.exp(log_computed)
     share = _share_of_log(log_computed, errors)
     slope = share / jnp.maximum(ratio, LOG_RATIO_FROM) + 1 - share
-    unit = jnp.where(values > errors, values, errors)
+    y = jnp.where(values > errors, values, errors)
     is_log = (share == 1) & (ratio >= LOG_RATIO_FROM)
-    change = -2 * (jnp.log(jnp.where(is_log, 1.0, unit * slope)) - log_computed)
+    change = -2 * (jnp.log(jnp.where(is_log, 1.0, y * slope)) - log_computed)
     return jnp.where(is_log, 0.0, change)
 
 

@@ -39,8 +39,8 @@ RATIO = 1
 RATE_ERROR_LENGTH = 1.0
 """Change of ln T over which the error of theory's cooling rate is correlated."""
 
-SAMPLE_MEMORY = 0.57
-"""Decay of the sampling error of T, over the collisions of a grain.
+SAMPLE_DECAY_RATE = 0.57
+"""Rate at which the sampling error of T is forgotten, per collision of a grain.
 
 Measured: 60 of 250 spheres, eps = .9, 400 replicas: correlations .75, .56, .42, .33, .26, .20 after
 .5, 1, ..., 3 collisions."""
@@ -80,7 +80,7 @@ class Filtered(NamedTuple):
     """Innovations of columns of residuals, which share their variances.
 
     Attributes:
-        values: 0 where nothing is used, shape (nodes, 2, columns, gases).
+        values: of T and of T_rot, 0 where nothing is used, shape (nodes, 2, columns, gases).
         variances: of the innovations; where nothing is used, the variance that a value would
             have; shape (nodes, 2, gases).
     """
@@ -102,6 +102,9 @@ def filtered(
 ) -> Filtered:
     """Return the innovations of columns of residuals, and the variances that they share.
 
+    The second axis of arrays is T, T_rot. More columns cost little, since covariances do not depend
+    on residuals.
+
     Args:
         gas: neighbouring scenes: its floats have an axis (gases,).
         nodes: their curves by kinetic theory.
@@ -118,11 +121,11 @@ def filtered(
         start = _start(steps, noise, residuals)
         unit = jnp.eye(len(start.mean), dtype=residuals.dtype)[..., None]
         turning = nodes.rotation > 0
-        of_y = (nodes.rotation + ROTATION_OFFSET) / jnp.where(turning, nodes.rotation, jnp.inf)
+        positive = jnp.where(turning, nodes.rotation, jnp.inf)  # a slope of 0 without rotation
         at_nodes = _AtNode(
             growth=steps.growth,
-            increment=steps.increments,
-            rotation_slope=of_y,
+            increment=steps.increment,
+            rotation_slope=(nodes.rotation + ROTATION_OFFSET) / positive,
             by_size_ratio=nodes.by_size_ratio,
             residuals=residuals,
             variances=variances + SMALLEST_VARIANCE,
@@ -143,34 +146,38 @@ class _Steps(NamedTuple):
 
     Attributes:
         start: covariance of the variables of the run at its start, shape (k, k, gases).
-        growth: propagators less 1, shape (nodes, n, n, gases).
-        increments: what is added to the covariance, shape (nodes, n, n, gases).
+        growth: F - 1 with the propagator F, shape (nodes, n, n, gases).
+        increment: what a step adds to the covariance, shape (nodes, n, n, gases).
         sizes: standard deviations of the passing errors, shape (nodes, n - k - 1, gases).
         at_start: their variances at t = 0 over those in the long run, shape (n - k - 1,).
     """
 
-    start: Any
-    growth: Any
-    increments: Any
-    sizes: Any
-    at_start: Any
+    start: Array
+    growth: Array
+    increment: Array
+    sizes: Array
+    at_start: np.ndarray
 
 
 def _steps(gas: Gas, nodes: Nodes, noise: Noise, differentiable: bool) -> _Steps:
     """Return the steps of all variables; the passing errors are independent of all others."""
     process = _process(gas, nodes, noise)
     shape = process.drift.shape
-    flat = (*shape[:2], -1)
     doublings = NUM_DOUBLINGS if differentiable else _needed_doublings(process.drift)
-    of_run = propagators(process.drift.reshape(flat), process.noise.reshape(flat), doublings)
+    flat = (*shape[:2], -1)  # nodes and gases are one axis of `propagators`
+    drift = process.drift.reshape(flat)
+    diffusion = process.diffusion.reshape(flat)
+    growth, increment = propagators(drift, diffusion, doublings)
     errors = _passing_errors(gas, nodes, noise)
+    growth = _with_more_variables(growth.reshape(shape), len(errors))
+    increment = _with_more_variables(increment.reshape(shape), len(errors))
+    # Each passing error is an Ornstein-Uhlenbeck process, of variance 1 in the long run.
     decays = jnp.stack([error.decay for error in errors], axis=1)
-    growth, increments = (_with_more_variables(x.reshape(shape), len(errors)) for x in of_run)
     places = shape[0] + np.arange(len(errors))
     return _Steps(
         start=process.start,
         growth=growth.at[:, places, places].set(jnp.expm1(-decays)),
-        increments=increments.at[:, places, places].set(-jnp.expm1(-2 * decays)),
+        increment=increment.at[:, places, places].set(-jnp.expm1(-2 * decays)),
         sizes=jnp.stack([error.size for error in errors], axis=1),
         at_start=np.array([error.at_start for error in errors]),
     )
@@ -193,18 +200,18 @@ class _PassingError(NamedTuple):
 def _passing_errors(gas: Gas, nodes: Nodes, noise: Noise) -> list[_PassingError]:
     """Return the sampling error, and the scatter by contacts of soft spheres."""
     collisions = _change(nodes.collisions)
-    sample = jnp.broadcast_to(jnp.sqrt(noise.sample), collisions.shape)
-    errors = [_PassingError(SAMPLE_MEMORY * collisions, sample, at_start=1.0)]
+    size = jnp.broadcast_to(jnp.sqrt(noise.sample), collisions.shape)
+    errors = [_PassingError(SAMPLE_DECAY_RATE * collisions, size, at_start=1.0)]
     log_T = nodes.log_temperature - nodes.log_temperature[:1]
     contacts = jax.vmap(contact_noise, in_axes=(0, -1), out_axes=-1)(gas, log_T)
     if contacts is not None:
         size = jnp.sqrt(noise.inverse_number * noise.contacts) * contacts.size
-        decay = _without_mirrored(collisions / contacts.memory, nodes.is_before)
+        decay = _forgotten_across_start(collisions / contacts.memory, nodes.is_before)
         errors.append(_PassingError(decay, size, at_start=0.0))
     return errors
 
 
-def _without_mirrored(
+def _forgotten_across_start(
     decay: Float[Array, "nodes gases"], is_before: Bool[Array, "nodes"] | None
 ) -> Array:
     """Return a decay that is complete next to nodes whose times are before the start.
@@ -222,33 +229,32 @@ class _Process(NamedTuple):
 
     Attributes:
         start: covariance of the variables of the run at its start, see `_Steps`.
-        drift: matrix of the equation times each step, shape (k + 1, k + 1, nodes, gases).
-        noise: covariance of its noise times each step, of the same shape.
+        drift: matrix J of the equation times each step, shape (k + 1, k + 1, nodes, gases).
+        diffusion: matrix Q of its random term times each step, of the same shape.
     """
 
     start: Array
     drift: Array
-    noise: Array
+    diffusion: Array
 
 
 def _process(gas: Gas, nodes: Nodes, noise: Noise) -> _Process:
     """Return the equation, whose coefficients are constant from a node to the next one."""
-    first = nodes.log_temperature[:1]
     means = Mean(
-        nodes.log_temperature - first,
+        nodes.log_temperature - nodes.log_temperature[:1],
         jnp.broadcast_to(nodes.sonine[:, None], nodes.rotation.shape),
         nodes.collisions,
         Spins(nodes.rotation, None, None),
         nodes.size_ratio,
     )
-    rates = jax.vmap(run_process, in_axes=(0, -1), out_axes=-1)
-    jacobian, spread, starts = rates(gas, jax.tree.map(_middle, means))
+    process_of_gases = jax.vmap(run_process, in_axes=(0, -1), out_axes=-1)
+    jacobian, diffusion, starts = process_of_gases(gas, jax.tree.map(_middle, means))
     collisions = _change(nodes.collisions)
     rate_error = len(jacobian)
     size = rate_error + 1
     zeros = jnp.zeros((size, size, *nodes.rotation.shape), jacobian.dtype)
-    of_grains = noise.inverse_number * spread * collisions
-    random = zeros.at[:rate_error, :rate_error].set(of_grains)
+    diffusion = noise.inverse_number * diffusion * collisions
+    diffusion = zeros.at[:rate_error, :rate_error].set(diffusion)
     drift = zeros.at[:rate_error, :rate_error].set(jacobian * collisions)
     # An error of the rate moves all temperatures along their mean course.
     error = _middle(noise.rate_error)[:, None]
@@ -259,11 +265,11 @@ def _process(gas: Gas, nodes: Nodes, noise: Noise) -> _Process:
         drift = drift.at[RATIO, rate_error].set(error * change_of_y)
     if nodes.size_ratio is not None:
         drift = drift.at[RATIO, rate_error].set(error * _change(nodes.size_ratio))
-    memory = jnp.abs(change_of_T) / RATE_ERROR_LENGTH
+    decay = jnp.abs(change_of_T) / RATE_ERROR_LENGTH
     return _Process(
         start=noise.inverse_number * starts[:, :, 0],
-        drift=drift.at[rate_error, rate_error].set(-memory),
-        noise=random.at[rate_error, rate_error].set(2 * memory),
+        drift=drift.at[rate_error, rate_error].set(-decay),
+        diffusion=diffusion.at[rate_error, rate_error].set(2 * decay),
     )
 
 
@@ -304,13 +310,13 @@ class _State(NamedTuple):
 def _start(steps: _Steps, noise: Noise, residuals: Array) -> _State:
     """Return the state at t = 0, before any of some residuals."""
     size = steps.growth.shape[1]
-    of_run = len(steps.start)
+    rate_error = len(steps.start)
     mean = jnp.zeros((size, *residuals.shape[2:]), residuals.dtype)
     # The error of the rate and passing errors are over their standard deviations.
-    variances = np.concatenate([np.ones(of_run + 1), steps.at_start])
+    variances = np.concatenate([np.ones(rate_error + 1), steps.at_start])
     diagonal = jnp.asarray(np.diag(variances), residuals.dtype)[..., None]
     covariance = jnp.broadcast_to(diagonal, (size, size, residuals.shape[-1]))
-    covariance = covariance.at[:of_run, :of_run].set(steps.start)
+    covariance = covariance.at[:rate_error, :rate_error].set(steps.start)
     covariance = covariance.at[LOG_T, LOG_T].add(noise.inverse_number * noise.first)
     return _State(mean, covariance)
 
@@ -345,41 +351,50 @@ def _filter_step(unit: Array, state: _State, at: _AtNode) -> tuple[_State, Filte
         state: at the node before.
         at: the node.
     """
-    growth = at.growth
-    mean = state.mean + jnp.sum(growth[:, :, None] * state.mean[None], axis=1)
-    moved = state.covariance + product(growth, state.covariance)
-    covariance = moved + product(moved, transposed(growth)) + at.increment
-    state = _State(mean, covariance)
-    # Measured: ln T of the gas with the passing errors, and ln T_rot = ln T + ln(T_rot/T).
-    first = len(mean) - len(at.sizes)
-    of_T = at.sensitivity * unit[LOG_T] + jnp.sum(unit[first:] * at.sizes[:, None], axis=0)
-    if at.by_size_ratio is not None:  # T by the energy also depends on q
-        of_T = of_T + at.sensitivity * at.by_size_ratio * unit[RATIO]
-    of_rotation = unit[LOG_T] + at.rotation_slope * unit[RATIO]
+    state = _predict(state, at.growth, at.increment)
     innovations = []
     variances = []
-    for column, weights in enumerate((of_T, of_rotation)):
-        state, innovation, variance = _with_value(
-            state, weights, at.residuals[column], at.variances[column], at.used[column]
+    for quantity, weights in enumerate(_weights(unit, at)):
+        state, innovation, variance = _update(
+            state, weights, at.residuals[quantity], at.variances[quantity], at.used[quantity]
         )
         innovations.append(innovation)
         variances.append(variance)
     return state, Filtered(jnp.stack(innovations), jnp.stack(variances))
 
 
-def _with_value(
+def _predict(state: _State, growth: Array, increment: Array) -> _State:
+    """Return the state at the next node, before its values: F x and F C F^T + the increment."""
+    mean = state.mean + jnp.sum(growth[:, :, None] * state.mean[None], axis=1)
+    moved = state.covariance + product(growth, state.covariance)
+    covariance = moved + product(moved, transposed(growth)) + increment
+    return _State(mean, covariance)
+
+
+def _weights(unit: Array, at: _AtNode) -> tuple[Array, Array]:
+    """Return the weights of the variables in the measured ln T and ln T_rot, shape (n, gases)."""
+    first = len(unit) - len(at.sizes)
+    passing = jnp.sum(unit[first:] * at.sizes[:, None], axis=0)
+    of_T = at.sensitivity * unit[LOG_T] + passing
+    if at.by_size_ratio is not None:  # T by the energy also depends on q
+        of_T = of_T + at.sensitivity * at.by_size_ratio * unit[RATIO]
+    of_T_rot = unit[LOG_T] + at.rotation_slope * unit[RATIO]  # ln T_rot = ln T + ln(T_rot/T)
+    return of_T, of_T_rot
+
+
+def _update(
     state: _State, weights: Array, value: Array, variance: Array, used: Array
 ) -> tuple[_State, Array, Array]:
     """Return the state after a value, its innovation and its variance.
 
     The value is the sum of the variables with these weights, shape (n, gases), and an independent
-    error of the given variance.
+    error of the given variance. It changes nothing where `used` is 0.
     """
     mean, covariance = state
     with_value = jnp.sum(covariance * weights, axis=1)
-    total = jnp.sum(weights * with_value, axis=0) + variance
+    innovation_variance = jnp.sum(weights * with_value, axis=0) + variance
     innovation = used * (value - jnp.sum(weights[:, None] * mean, axis=0))
-    gain = used * with_value / total
+    gain = used * with_value / innovation_variance
     mean = mean + gain[:, None] * innovation[None]
-    covariance = covariance - total * gain[:, None] * gain[None]
-    return _State(mean, covariance), innovation, total
+    covariance = covariance - innovation_variance * gain[:, None] * gain[None]
+    return _State(mean, covariance), innovation, innovation_variance

@@ -26,9 +26,10 @@ from jaxgran.fitting.result import Fit
 from jaxgran.fitting.time_grid import time_grid
 from jaxgran.models.kinetic_theory import KineticTheory
 from jaxgran.models.linearise import curve_of_program
-from jaxgran.scene.elements import Rough, StokesDrag, Walls
+from jaxgran.scene.elements import Rough, StokesDrag
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.parameters import symbol_of
+from jaxgran.scene.walls import Walls
 
 PARAMETER_SHIFT = float(np.log(1.5))
 """Shift of the first parameter of a truth, in the unconstrained scale: A is a guess."""

@@ -12,15 +12,10 @@ from jaxtyping import PRNGKeyArray
 from jaxgran._utils.tracing import any_traced
 from jaxgran.models.base import AbstractModel
 from jaxgran.models.scales import scales_at
-from jaxgran.scene.elements import (
-    NUM_SPIN_COMPONENTS,
-    VOLUME_TOLERANCE,
-    Rough,
-    check_elements,
-    container_volume_ratio,
-)
+from jaxgran.scene.elements import NUM_SPIN_COMPONENTS, Rough, check_elements
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import MIN_BOX, PACKING_LIMIT
+from jaxgran.scene.walls import VOLUME_TOLERANCE, container_volume_ratio
 from jaxgran.theory.steady_states import max_thermal_speed
 
 _max_thermal_speed = eqx.filter_jit(max_thermal_speed)

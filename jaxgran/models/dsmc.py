@@ -42,7 +42,7 @@ class DSMC(AbstractParticleModel):
 
     Supports all elements of a scene but `jaxgran.Frictional`: rough spheres; walls, which all
     particles of the homogeneous gas hit with the same probability, more often the more energy the
-    walls take (`jaxgran.scene.elements`); drag, exactly, by collisions in transformed time
+    walls take (`jaxgran.scene.walls`); drag, exactly, by collisions in transformed time
     (`jaxgran.particles.elements`), up to gamma t = 18 (8 in float32); a drive, with half of the
     kicks at the beginning of each step and half at its end, on subsets of the particles in turn
     (`jaxgran.particles.dsmc.dynamics`).

@@ -73,7 +73,7 @@ Measured: kinetic theory against DSMC, 200000 particles, constant restitution: T
 
 WALL_ERROR = 0.012
 """Relative error of a cooling rate that assumes a mixed gas between walls, over (T/T_0)^(1/2),
-apart from the layer before them (`jaxgran.scene.elements`).
+apart from the layer before them (`jaxgran.scene.walls`).
 
 Measured, phi = .03: the time in which hard spheres cool to T/T_0 = .5, .2, .1, .03 is longer than
 in theory by 1.0, .7, .5, .3 +- .1 % for N = 250 and eps_w = .9, by 1.2, 1.0, .8, .7 % for N = 60,

@@ -92,7 +92,7 @@ class HardSpheres(AbstractSpheres):
     given start T_0 is a unit only, and its derivative is 0; the start scales with the diameter.
 
     The positions of spheres between walls are not remembered, except that the gas is denser before
-    walls the more energy they take (`jaxgran.scene.elements`). Compared with differences (N = 500,
+    walls the more energy they take (`jaxgran.scene.walls`). Compared with differences (N = 500,
     eps_w = .8) a derivative in eps_w is right within 2 %. With rough walls the derivative of T_rot
     in beta_t is up to 20 % too small, since spins near walls differ from spins in the middle.
 

@@ -102,7 +102,7 @@ class KineticTheory(AbstractModel):
     Supports all elements of a scene but lasting friction, in a homogeneous gas: rough spheres, with
     T_rot, with the correlation and the kurtosis of spins to first order (T within 1.2 % of DSMC;
     T_rot/T: see `rotation_accuracy`); walls, with the denser layer before them
-    (`jaxgran.scene.elements`); drag; a drive by white noise. Between walls the curve has no D and
+    (`jaxgran.scene.walls`); drag; a drive by white noise. Between walls the curve has no D and
     <dr^2>.
 
     Spheres of unequal sizes (`Gas.diameter_sd`) are two halves of small and large spheres with a

@@ -17,9 +17,10 @@ from jaxtyping import Array, Float
 from jaxgran._utils.tracing import as_jax_arrays, fast_jit, grid_size
 from jaxgran.data.curve import CoolingCurve
 from jaxgran.models.base import AbstractModel
-from jaxgran.scene.elements import Rough, StokesDrag, Walls
+from jaxgran.scene.elements import Rough, StokesDrag
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.laws import Viscoelastic, ViscoelasticVariant
+from jaxgran.scene.walls import Walls
 
 LINEARISED = "temperature", "rotational_temperature", "displacement", "collisions", "size_ratio"
 """Fields of a curve that are linearised, if the model computes them."""

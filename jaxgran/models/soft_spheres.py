@@ -20,7 +20,7 @@ from jaxgran.models.spheres import AbstractSpheres
 from jaxgran.particles.capacity import capacities, grid, round_up
 from jaxgran.particles.soft.dynamics import SoftDynamics
 from jaxgran.scene.contact import elastic_constant
-from jaxgran.scene.elements import Frictional, Walls
+from jaxgran.scene.elements import Frictional
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import wrap_on_host
 from jaxgran.scene.laws import Viscoelastic
@@ -32,6 +32,7 @@ from jaxgran.scene.reduced import (
     SphereScene,
     sphere_scene,
 )
+from jaxgran.scene.walls import Walls
 
 PROJECTION = 0.1
 """Mean free times between thermal projections of a derivative."""

@@ -21,9 +21,10 @@ from jaxgran.particles.dynamics import AbstractProcess
 from jaxgran.particles.neighbours.lists import search_pairs
 from jaxgran.particles.neighbours.pairs import with_offsets
 from jaxgran.particles.snapshot import box_side
-from jaxgran.scene.elements import NUM_SPIN_COMPONENTS, Walls
+from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.geometry import PACKING_LIMIT, sphere_surface, wrap
+from jaxgran.scene.walls import Walls
 
 GAP = 1e-3
 """Smallest distance, in diameters, between the surfaces to which a pair is pushed apart."""

@@ -15,14 +15,7 @@ from jaxgran._utils.tracing import any_traced
 from jaxgran._utils.validation import POSITIVE, Domain, UserNumber, checked_int, float_array
 from jaxgran.scene import laws
 from jaxgran.scene.contact import ELASTIC_CONTACT_TIME, ELASTIC_OVERLAP
-from jaxgran.scene.elements import (
-    Frictional,
-    Rough,
-    StokesDrag,
-    Walls,
-    WhiteNoise,
-    check_elements,
-)
+from jaxgran.scene.elements import Frictional, Rough, StokesDrag, WhiteNoise, check_elements
 from jaxgran.scene.geometry import (
     CLOSE_PACKING,
     contact_value,
@@ -44,6 +37,7 @@ from jaxgran.scene.parameters import (
     optional_number_named,
     unit_of,
 )
+from jaxgran.scene.walls import Walls
 
 PACKING_DOMAINS = {d: Domain(0.0, close) for d, close in CLOSE_PACKING.items()}
 """Allowed packing fractions, by dimension."""

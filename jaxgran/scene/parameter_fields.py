@@ -8,9 +8,10 @@ import equinox as eqx
 import jax
 
 from jaxgran._utils.validation import ANY, Domain
-from jaxgran.scene.elements import Element, Walls
+from jaxgran.scene.elements import Element
 from jaxgran.scene.laws import RestitutionLaw
 from jaxgran.scene.parameters import PREFIXES
+from jaxgran.scene.walls import Walls
 
 
 class ParameterField(NamedTuple):

@@ -44,9 +44,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxgran.data.curve import CoolingCurve
-from jaxgran.scene.elements import NUM_SPIN_COMPONENTS, wall_impact_ratio
+from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.gas import Gas
 from jaxgran.scene.reduced import ReducedRough, ReducedScene, ReducedWalls, reduced_scene
+from jaxgran.scene.walls import wall_impact_ratio
 from jaxgran.theory.averages import (
     collision_rate,
     loss_moments,

@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxgran.scene.elements import MAX_WALL_IMPACT_RATIO, NUM_SPIN_COMPONENTS, wall_impact_ratio
+from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.geometry import impact_average
 from jaxgran.scene.reduced import ReducedRough, ReducedScene, ReducedWalls
+from jaxgran.scene.walls import MAX_WALL_IMPACT_RATIO, wall_impact_ratio
 from jaxgran.theory.averages import collision_rate
 from jaxgran.theory.moments import Spins
 from jaxgran.theory.rough_impacts import coulomb_limit, mean_impulse, rough_impact_means

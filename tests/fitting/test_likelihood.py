@@ -9,7 +9,7 @@ import pytest
 
 import jaxgran
 from jaxgran.fitting.comparison import Comparison
-from jaxgran.fitting.kalman import SAMPLE_MEMORY, Nodes, filtered
+from jaxgran.fitting.kalman import SAMPLE_DECAY_RATE, Nodes, filtered
 from jaxgran.fitting.measured_rows import curve_rows
 from jaxgran.fitting.prediction import predicted_curve
 from jaxgran.fitting.rows import Noise
@@ -106,7 +106,7 @@ def test_the_error_of_a_sample_of_grains_is_remembered():
     arguments = nodes, residuals, np.zeros((size, 2, 1)), column + 1, used, noise
     found, spread = filtered(gas, *jax.tree.map(jnp.asarray, arguments))
     innovation, of_innovation = (np.asarray(x)[:, 0].ravel() for x in (found, spread))
-    covariance = variance * np.exp(-SAMPLE_MEMORY * np.abs(tau[:, None] - tau))
+    covariance = variance * np.exp(-SAMPLE_DECAY_RATE * np.abs(tau[:, None] - tau))
     square = values @ np.linalg.solve(covariance, values)
     # The filter adds a variance of 1e-12 to each value.
     assert np.sum(innovation**2 / of_innovation) == pytest.approx(square, rel=1e-8)

@@ -54,8 +54,9 @@ from jaxgran.particles.elements import (
     threefry_key,
 )
 from jaxgran.particles.start import maxwellian_spins, maxwellian_velocities
-from jaxgran.scene.elements import NUM_SPIN_COMPONENTS, wall_impact_ratio
+from jaxgran.scene.elements import NUM_SPIN_COMPONENTS
 from jaxgran.scene.reduced import ReducedScene
+from jaxgran.scene.walls import wall_impact_ratio
 from jaxgran.theory.averages import collision_rate
 
 FASTEST_SPEED = 3.5

@@ -17,9 +17,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxgran.gradients.tangents import ExchangeTangents
 from jaxgran.particles.elements import DragDecay, drag_decay, tangential_impulse
-from jaxgran.scene.elements import wall_impact_ratio
 from jaxgran.scene.laws import ReducedLaw
 from jaxgran.scene.reduced import ReducedScene, SphereScene
+from jaxgran.scene.walls import wall_impact_ratio
 
 
 class LawOfReplicas(ReducedLaw):
