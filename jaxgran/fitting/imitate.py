@@ -158,8 +158,8 @@ def imitate(
         are runs of the fitted scene alone.
 
     Raises:
-        ValueError: for a fit of several measurements or without N, more than 5e6 grains in all, or
-            runs below 2.
+        ValueError: for a fit of several measurements or without N, a model of another number of
+            particles, more than 5e6 grains in all, or runs below 2.
         KeyboardInterrupt: if it is interrupted before the first fit.
 
     >>> small = dataclasses.replace(measurement, num_particles=50)
@@ -169,7 +169,7 @@ def imitate(
     """
     check_bool(progress=progress)
     runs = checked_int("runs", runs, MIN_RUNS)
-    _check(result, runs)
+    _check(result, runs, model)
     measurement = _at_the_estimate(result)
     key = checked_key(key)
     key = jax.random.key(0) if key is None else key
@@ -190,7 +190,7 @@ def imitate(
     return replace(found, strongest=other)
 
 
-def _check(result: Any, runs: int) -> None:
+def _check(result: Any, runs: int, model: AbstractModel | None) -> None:
     """Raise ValueError unless a result can be imitated."""
     if not isinstance(result, Fit):
         raise ValueError(
@@ -209,6 +209,13 @@ def _check(result: Any, runs: int) -> None:
         raise ValueError(
             f"{runs} imitations of {measurement.replicas} x {N} grains are {grains:.2g} grains; "
             f"{MAX_GRAINS:.2g} are allowed: ask for {fewer} runs or fewer"
+        )
+    number = N if model is None else getattr(model, "num_particles", None)
+    if number != N:
+        raise ValueError(
+            f"imitate needs a particle model of the {N} grains of the measurement, got "
+            f"{type(model).__name__} of {number or 'no'} particles: give num_particles={N}, or "
+            "leave model out"
         )
     if result.names[0] not in result.gas.domains:
         raise ValueError(

@@ -297,7 +297,7 @@ def _unreachable_with_drag(gas: Gas, times: Float[Array, "times"]) -> Bool[Array
     """
     if gas.drag is None:
         return jnp.zeros(times.shape, bool)
-    limit = float(-0.5 * np.log(np.finfo(times.dtype).eps))  # beyond it 1 - gamma s is 0
+    limit = float(-0.5 * np.log(np.finfo(times.dtype).eps))  # half of the digits of 1 - gamma s
     too_late = gas.drag.rate * times > limit
     if is_known(too_late) and np.any(np.asarray(too_late)):
         raise ValueError(

@@ -135,7 +135,7 @@ def wall_impact_ratio(
     - Third factor: in a box of many mean free paths heat must be conducted to the wall. In a gas
       that cools everywhere at the same rate the profile of T is a parabola, and T at the wall is
       ``q W/(6 kappa)`` below the mean. The ratio of the two is ``y = 1 - a sqrt(y)`` with
-      ``a = (1 - eps) n W sqrt(2 T/pi) T/(6 kappa T)``.
+      ``a = (1 - eps) n W sqrt(2 T/pi)/(6 kappa)``.
 
     The formula agrees with measurements within 3.5 % for eps from 0.6 to 0.9 and Kn from 0.09 to
     1.2; see `jaxgran.models.error_model.WALL_ERROR`. The ratio is too large for Kn >> 1, where

@@ -113,6 +113,14 @@ def test_what_cannot_be_imitated_is_refused(measurements, message):
         jaxgran.imitate(result, 100)
 
 
+@pytest.mark.parametrize("model", [jaxgran.DSMC(10), jaxgran.KineticTheory()])
+def test_a_model_of_another_number_of_particles_imitates_nothing(model):
+    result = FakeFit(jaxgran.cool(GAS, TIMES))
+    object.__setattr__(result, "measurements", {"": planned(num_particles=50)})
+    with pytest.raises(ValueError, match="of the 50 grains .* num_particles=50"):
+        jaxgran.imitate(result, 100, model=model)
+
+
 @pytest.mark.slow
 def test_interrupted_imitations_give_what_they_have(monkeypatch):
     measurement = planned(absent=("walls", "roughness", "drag"))
