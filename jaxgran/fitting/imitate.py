@@ -1,5 +1,6 @@
 """Imitations of a measurement: runs of the fitted scene by particles, each of them fitted."""
 
+import contextlib
 import warnings
 from dataclasses import dataclass, replace
 from functools import partial
@@ -178,16 +179,16 @@ def imitate(
     )
     strongest = strongest_effect(result)
     found = imitate_truth(AS_GIVEN, measurement, key=key)
-    if strongest is None or found.runs < runs:
+    if strongest is None:
         return found
-    beside = replace(measurement, gas=measurement.gas.replace(**strongest.values))
-    try:
-        other = imitate_truth(strongest.truth, beside, key=jax.random.fold_in(key, 1))
-    except KeyboardInterrupt:
-        text = f'interrupted before an imitation "{strongest.truth.name}" was fitted'
-        warnings.warn(f"{text}: the result holds those of the fitted scene alone", stacklevel=2)
-        return found
-    return replace(found, strongest=other)
+    if found.runs == runs:
+        beside = replace(measurement, gas=measurement.gas.replace(**strongest.values))
+        with contextlib.suppress(KeyboardInterrupt):
+            other = imitate_truth(strongest.truth, beside, key=jax.random.fold_in(key, 1))
+            return replace(found, strongest=other)
+    text = f'interrupted before an imitation "{strongest.truth.name}" was fitted'
+    warnings.warn(f"{text}: the result holds those of the fitted scene alone", stacklevel=2)
+    return found
 
 
 def _check(result: Any, runs: int, model: AbstractModel | None) -> None:

@@ -77,6 +77,16 @@ def test_gaps_between_frames_do_not_count_as_errors():
     assert error_by_second_differences(motion) < error
 
 
+def test_frames_at_uneven_times_do_not_count_as_errors():
+    error = 1e-5
+    t = np.tile((np.arange(90) + np.arange(90) // 2) / 500, 6)  # frames at 0, 1, 3, 4, 6, 7, ...
+    ids = np.repeat(np.arange(6), 90)
+    noise = error * np.random.default_rng(0).standard_normal((3, t.size))
+    paths = {name: 0.3 * t + noise[k] for k, name in enumerate("xyz")}
+    motion = Motion.from_columns({"id": ids, "t": t} | paths, {}, lines=list(range(ids.size)))
+    assert error_by_second_differences(motion) == pytest.approx(error, rel=0.06)
+
+
 def test_impacts_on_walls_are_found_wherever_they_lie_between_frames():
     # 15 x 15 spheres move along x between two walls, and are reflected with eps = .9.
     gas = glass_beads()

@@ -90,6 +90,13 @@ def test_additions_change_what_they_say():
         planned(glass_beads(packing_fraction=0.12), priors={"packing_fraction": (0.12, 0.006)})
     )
     assert np.isclose(thin.priors["packing_fraction"][1], 0.002)
+    dense_gas = glass_beads(packing_fraction=0.12)
+    dense_box = dataclasses.replace(dense_gas, container=jaxgran.Walls(0.05, restitution=0.9))
+    few = candidates.second_density(
+        dataclasses.replace(planned(dense_gas), gas=dense_box, num_particles=20)
+    )
+    assert few.num_particles == 7
+    assert np.isclose(few.gas.packing_fraction, 0.12 * 7 / 20)  # a part of a grain has no volume
 
 
 def test_only_errors_that_a_fit_counts_are_planned():
