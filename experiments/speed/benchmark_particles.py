@@ -182,36 +182,40 @@ DISSIPATION = 0.3
 """Dissipation parameter of viscoelastic spheres, in C at the speed 1."""
 
 GOALS = {
-    ("hard spheres", 256): (4.0, 4.0),
-    ("hard spheres", 4096): (1.5, 1.3),
-    ("hard spheres", 50_000): (3.0, 2.0),
-    ("DSMC", 10_000): (3.0, 2.5),
-    ("DSMC", 1_000_000): (1.0, 1.0),
+    (256, 1): (4.0, 4.0),
+    (256, 8): (2.5, 2.5),
+    (4096, 1): (1.5, 1.3),
+    (50_000, 1): (3.0, 2.0),
 }
-"""Ratios to C that are aimed at: at phi = .05 and .25, of constant and viscoelastic eps."""
+"""Ratios to C that are aimed at by N and replicas, at phi = .05 and .25."""
+
+DSMC_GOALS = {10_000: (3.0, 2.5), 1_000_000: (1.0, 1.0)}
+"""Ratios to C that are aimed at, of constant and viscoelastic eps."""
 
 
 def references(options: Options) -> Iterator[dict]:
-    hard_sizes, dsmc_sizes, repeats = (256, 4096, 50_000), (10_000, 1_000_000), 7
+    hard_sizes = (256, 1), (256, 8), (4096, 1), (50_000, 1)
+    dsmc_sizes, repeats = (10_000, 1_000_000), 7
     if options.smoke:
-        hard_sizes, dsmc_sizes, repeats = (256,), (10_000,), 1
+        hard_sizes, dsmc_sizes, repeats = ((256, 1),), (10_000,), 1
     with tempfile.TemporaryDirectory() as folder:
         hard = compiled_by_c("hard_spheres", folder)
-        for size, phi in itertools.product(hard_sizes, (0.05, 0.25)):
+        for (size, replicas), phi in itertools.product(hard_sizes, (0.05, 0.25)):
             each = 40 if size < 10_000 else 8  # collisions per sphere
             command = hard, size, phi, each, RESTITUTION
-            start = cool(hard_beads(phi, RESTITUTION), [0.0], jaxgran.HardSpheres(size)).particles
-            model = jaxgran.HardSpheres(size, start=start)
-            row = {"program": "hard spheres", "num_particles": size, "packing_fraction": phi}
-            row["goal"] = GOALS["hard spheres", size][phi > 0.1]
-            yield row | beside_c(command, hard_beads(phi, RESTITUTION), model, each, repeats)
+            gas = hard_beads(phi, RESTITUTION)
+            start = cool(gas, [0.0], jaxgran.HardSpheres(size, replicas)).particles
+            model = jaxgran.HardSpheres(size, replicas, start=start)
+            row = {"program": "hard spheres", "num_particles": size, "replicas": replicas}
+            row |= {"packing_fraction": phi, "goal": GOALS[size, replicas][phi > 0.1]}
+            yield row | beside_c(command, gas, model, each, repeats)
         direct = compiled_by_c("dsmc", folder)
         for size, viscoelastic in itertools.product(dsmc_sizes, (False, True)):
             each = 100 if size < 100_000 else 10
             gas = beads(PACKING, DISSIPATION) if viscoelastic else hard_beads(PACKING, RESTITUTION)
             command = direct, size, each, -DISSIPATION if viscoelastic else RESTITUTION
             row = {"program": "DSMC", "num_particles": size, "viscoelastic": viscoelastic}
-            row["goal"] = GOALS["DSMC", size][viscoelastic]
+            row["goal"] = DSMC_GOALS[size][viscoelastic]
             yield row | beside_c(command, gas, jaxgran.DSMC(size), each, repeats)
 
 
@@ -234,7 +238,8 @@ def beside_c(command: tuple, gas: jaxgran.Gas, model, each: int, repeats: int) -
     end = times_of(gas, [each])
     run = partial(cool, gas, end, model)
     set_up = partial(cool, gas, [0.0], model)
-    made = float(run().collisions[-1]) * model.num_particles / 2  # and compile
+    num_particles = model.num_particles * model.replicas
+    made = float(np.mean(run().collisions[-1])) * num_particles / 2  # and compile
     set_up()
     by_c, ours = [], []
     for _ in range(repeats):
