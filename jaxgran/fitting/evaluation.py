@@ -20,7 +20,7 @@ class Evaluation(NamedTuple):
 
     Attributes:
         value: -2 ln L, up to a constant.
-        gradient: its derivatives.
+        gradient: its derivatives, at the scatter of eps that is found.
         information: half of its expected second derivatives.
         rows: the residuals.
         curves: the computed curves at the times of the data, dictionaries of their fields.

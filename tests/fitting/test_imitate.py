@@ -160,6 +160,11 @@ def test_an_interruption_before_the_strongest_alternative_is_fitted_is_reported(
     with pytest.warns(UserWarning, match='before an imitation "with drag" was fitted'):
         found = jaxgran.imitate(result, 2, progress=False)
     assert found.runs == found.asked == 2 and found.strongest is None
+    monkeypatch.setattr(module, "cool", jaxgran.cool)
+    monkeypatch.setattr(module, "_fits", lambda measured, *others: [result])  # one of two runs
+    with pytest.warns(UserWarning, match='before an imitation "with drag" was fitted'):
+        found = jaxgran.imitate(result, 2, progress=False)
+    assert found.runs == 1 and found.strongest is None
 
 
 @pytest.mark.slow

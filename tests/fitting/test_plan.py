@@ -74,6 +74,8 @@ def test_additions_that_do_not_apply_are_left_out():
 def test_additions_change_what_they_say():
     longer = candidates.with_duration(SMOOTH, 4.0)
     assert np.allclose(longer.curve.times, np.geomspace(0.1, 40.0, 10))
+    late = planned(times=np.array([0.0, 1.0, 3.0]), priors={"t0": (1.0, 0.1)})
+    assert np.allclose(candidates.with_duration(late, 4.0).curve.times, [0.0, 1.0, 9.0])
     error = candidates.with_more_points(SMOOTH).curve.temperature_error
     assert np.allclose(error, SMOOTH.curve.temperature_error / 2**0.5)
     boxed = candidates.in_larger_box(BOXED)
